@@ -1,0 +1,6 @@
+"""Local correlation of patch features with feature maps, and patch extraction (the torch twins of two CUDA kernels)."""
+
+from devo.altcorr.correlation import corr
+from devo.altcorr.patches import patchify
+
+__all__ = ["corr", "patchify"]

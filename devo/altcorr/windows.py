@@ -1,0 +1,85 @@
+"""Windows around subpixel positions: integer base, bilinear fraction, pixel rows, zero padding, blending.
+
+Throughout this package a window of radius R has D = 2R+2 pixels a side; blending its four shifted (D-1, D-1)
+sub-windows bilinearly gives the (2R+1, 2R+1) values at the shifts -R..R of a subpixel position.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+FAR = 1 << 20
+"""Integer pixel that stands for 'outside of every map'; larger, infinite and NaN coordinates are clamped to it."""
+
+
+def split_coords(coords: Tensor) -> tuple[Tensor, Tensor]:
+    """Split positions into their integer pixel and the fraction beyond it.
+
+    Args:
+        coords: positions in pixels, any shape, floating point.
+
+    Returns:
+        `base` int64, floor of the position, clamped to +-`FAR` (NaN becomes `-FAR`), and `fraction` in [0, 1) in the
+        dtype of `coords`; NaN and infinite positions have the fraction NaN, so whatever is blended with it is NaN.
+    """
+    floor = coords.floor()
+    # casting NaN or what exceeds int64 is undefined, hence the clamp comes before the cast
+    base = floor.nan_to_num(nan=-FAR, posinf=FAR, neginf=-FAR).clamp(-FAR, FAR).long()
+    return base, coords - floor
+
+
+def window_rows(
+    base_x: Tensor, base_y: Tensor, frame: Tensor, size: tuple[int, int], radius: int
+) -> tuple[Tensor, Tensor]:
+    """Row numbers of the window pixels in a list of all pixels of all frames.
+
+    Args:
+        base_x: (N,) int64, integer column of each position.
+        base_y: (N,) int64, integer row of each position.
+        frame: (N,) int64, map that each position refers to.
+        size: height and width of the maps.
+        radius: R of the window.
+
+    Returns:
+        `rows` (N, D*D) int64 into the (F*H*W) pixels, 0 where the pixel is outside, and `inside` (N, D*D) bool.
+    """
+    height, width = size
+    shift = torch.arange(-radius, radius + 2, device=base_x.device)
+    x, y = base_x[:, None] + shift, base_y[:, None] + shift
+    inside = ((y >= 0) & (y < height))[:, :, None] & ((x >= 0) & (x < width))[:, None, :]
+    rows = ((frame[:, None] * height + y) * width)[:, :, None] + x[:, None, :]
+    return rows.masked_fill_(~inside, 0).flatten(1), inside.flatten(1)
+
+
+def blend(window: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+    """Bilinear interpolation inside windows.
+
+    Args:
+        window: (..., D, D) values, rows then columns.
+        dx: (...) fraction along the columns, in the dtype of `window`.
+        dy: (...) fraction along the rows.
+
+    Returns:
+        (..., D-1, D-1) values at the shifted positions.
+    """
+    along_x = torch.lerp(window[..., :-1], window[..., 1:], dx[..., None, None])
+    return torch.lerp(along_x[..., :-1, :], along_x[..., 1:, :], dy[..., None, None])
+
+
+def spread(grad: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+    """Transpose of `blend`: distribute (..., D-1, D-1) gradients over the (..., D, D) window."""
+    dx, dy = dx[..., None, None], dy[..., None, None]
+    side = grad.shape[-1] + 1
+    rows = grad.new_zeros(*grad.shape[:-2], side, side - 1)
+    rows[..., :-1, :] = grad * (1 - dy)
+    rows[..., 1:, :] += grad * dy
+    window = grad.new_zeros(*grad.shape[:-2], side, side)
+    window[..., :-1] = rows * (1 - dx)
+    window[..., 1:] += rows * dx
+    return window
+
+
+def pixel_rows(maps: Tensor) -> Tensor:
+    """View maps (F, C, H, W) as pixels (F*H*W, C); a copy unless the maps are stored channels-last."""
+    return maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1])

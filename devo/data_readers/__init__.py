@@ -1,0 +1,1 @@
+"""Sources of training clips: the common interface and the TartanAir reader."""

@@ -1,0 +1,210 @@
+"""Forward pass of training: the update operator and bundle adjustment, unrolled over a growing patch graph.
+
+Several clips of equal length are joined into one block-diagonal graph: frame `f` of clip `c` has index `c*n + f`, patch `p`
+of clip `c` has index `c*n*M + p`. All clips have the same edges, so that every operation runs once for all of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from devo.errors import InputError
+from devo.unroll_state import GrowingGraph, JoinedClips, UnrollSettings
+
+if TYPE_CHECKING:
+    from devo.enet import eVONet
+    from devo.lietorch import SE3
+
+BOUNDS_MARGIN = 64.0  # quarter-resolution pixels around the image within which a reprojection is used
+SOLVER_DAMPING = 10.0
+DEPTH_DAMPING = 1e-4
+
+
+class UnrollStep(NamedTuple):
+    """What one update produced; the first thirteen fields are those of the published training code.
+
+    Coordinates are quarter-resolution pixels (x,y). `*_full` fields, `scores`, `kk_full` and `frame_distance` are given
+    for the last update only, None before.
+    """
+
+    valid: Tensor
+    """(1,S) bool: the true point of this supervised edge lies in front of the camera."""
+    coords: Tensor | None
+    """(1,S,P,P,2) reprojection after bundle adjustment; None where this update's adjustment carries no gradient."""
+    coords_gt: Tensor
+    """(1,S,P,P,2)."""
+    poses: SE3 | None
+    """(B,n) world -> camera after bundle adjustment; None as `coords`."""
+    patches: Tensor
+    """(1,B*n*M,3,P,P) patches after bundle adjustment."""
+    kl: float
+    scores: Tensor | None
+    """(B*n,M) score of each patch."""
+    valid_full: Tensor | None
+    coords_full: Tensor | None
+    coords_gt_full: Tensor | None
+    weight_full: Tensor | None
+    kk_full: Tensor | None
+    frame_distance: Tensor | None
+    predicted: Tensor
+    """(1,E,2) patch centre plus revision of all edges, before bundle adjustment."""
+    predicted_gt: Tensor
+    """(1,E,2)."""
+    predicted_valid: Tensor
+    """(1,E) bool: in front of the camera, inside the image, not hidden."""
+    weight: Tensor
+    """(1,E,2) confidence."""
+    start_error: Tensor
+    """(1,E) distance between reprojection and truth before the revision, no gradient."""
+
+
+class ProbeResult(NamedTuple):
+    """One update from a zero state on edges that stand alone."""
+
+    predicted: Tensor
+    """(1,E,2) patch centre plus revision."""
+    predicted_gt: Tensor
+    """(1,E,2)."""
+    predicted_valid: Tensor
+    """(1,E) bool."""
+    centre: Tensor
+    """(1,E,2) patch centre before the revision."""
+
+
+class UnrollResult(NamedTuple):
+    """Everything the losses need."""
+
+    steps: list[UnrollStep]
+    poses_gt: SE3
+    """(B,n) world -> camera, first frame of each clip = identity."""
+    probe: ProbeResult | None
+
+
+def unroll(network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor, *, STEPS: int = 12,
+           structure_only: bool = False, patches_per_image: int = 80) -> list[UnrollStep]:
+    """Training pass with the published schedule on raw clips; normalises `images` as `network.norm` says.
+
+    Arguments as in `unroll_clips`, `STEPS` updates; one `UnrollStep` per update.
+    """
+    settings = UnrollSettings(steps=STEPS, patches_per_image=patches_per_image, structure_only=structure_only)
+    return unroll_clips(network, network.normalize(images), poses, disps, intrinsics, settings).steps
+
+
+def unroll_clips(network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor,
+                 settings: UnrollSettings = UnrollSettings(), start_fraction: Tensor | None = None) -> UnrollResult:  # noqa: B008
+    """Run the training pass on B clips of n frames.
+
+    Args:
+        network: the network under training; its mode decides how patches are chosen.
+        images: (B,n,5,H,W) float32 normalised voxel grids (or (B,n,3,H,W) images), H and W multiples of 4.
+        poses: (B,n) true world -> camera.
+        disps: (B,n,H,W) true inverse depth in the unit of the poses.
+        intrinsics: (B,n,4) fx fy cx cy, full-resolution pixels.
+        settings: graph schedule.
+        start_fraction: (B,) start each clip's poses between identity (0) and the truth (1); default identity.
+
+    Raises:
+        InputError: shapes that do not fit.
+    """
+    _check_shapes(images, disps, intrinsics)
+    clips = JoinedClips(network, images, poses, disps, intrinsics, settings)
+    if not settings.structure_only:
+        clips.poses = clips.start_poses(start_fraction)
+    graph = GrowingGraph(clips)
+    steps = []
+    for step in range(settings.steps):
+        if step >= settings.initial_frames and graph.frames < clips.frames:
+            graph.grow()
+        last = step == settings.steps - 1
+        differentiable = last or step % settings.solver_gradient_every == 0
+        steps.append(_one_update(clips, graph, differentiable, last))
+        clips.poses, clips.patches = clips.poses.detach(), clips.patches.detach()
+    truth = type(clips.poses_gt)(clips.poses_gt.data.view(clips.clips, clips.frames, 7))
+    return UnrollResult(steps, truth, _probe(clips) if settings.probe and clips.frames > 1 else None)
+
+
+def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, last: bool) -> UnrollStep:
+    """Revise all edges once and solve for poses and depths; leaves the new state in `clips` and `graph`."""
+    from devo import projective_ops as pops
+    from devo.ba import BA
+
+    settings = clips.settings
+    ii, jj, kk = graph.edges
+    with torch.no_grad():
+        coords = pops.transform(clips.poses, clips.patches, clips.intrinsics, ii, jj, kk)
+    net, delta, weight = clips.update(graph.net.reshape(1, len(kk), -1), coords, ii, jj, kk, graph.groups)
+    graph.net = net.view(graph.net.shape)
+    middle = coords.shape[2] // 2
+    centre = coords[:, :, middle, middle]
+    target = centre + delta
+    bounds = [-BOUNDS_MARGIN, -BOUNDS_MARGIN, clips.width + BOUNDS_MARGIN, clips.height + BOUNDS_MARGIN]
+    with contextlib.nullcontext() if differentiable else torch.no_grad():
+        for _ in range(settings.solver_iterations):
+            clips.poses, clips.patches = BA(
+                clips.poses, clips.patches, clips.intrinsics, target, weight, DEPTH_DAMPING, ii, jj, kk, bounds,
+                ep=SOLVER_DAMPING, fixedp=1, structure_only=settings.structure_only, clips=clips.clips)
+    truth = graph.coords_gt[:, :, middle, middle].reshape(1, -1, 2)
+    start_error = (centre - truth).norm(dim=-1)
+    near = graph.select(graph.near)
+    moved = pops.transform(clips.poses, clips.patches, clips.intrinsics, *near) if differentiable else None
+    full = _full_report(clips, graph, weight) if last else (None,) * 6
+    return UnrollStep(
+        graph.valid[:, graph.near].reshape(1, -1), moved,
+        graph.coords_gt[:, graph.near].reshape(1, -1, *graph.coords_gt.shape[2:]),
+        clips.poses_of(graph.frames) if differentiable else None, clips.patches, 0.0, *full,
+        target, truth, graph.visible.reshape(1, -1), weight, start_error)
+
+
+def _full_report(clips: JoinedClips, graph: GrowingGraph, weight: Tensor) -> tuple[Tensor | None, ...]:
+    """What the scorer loss needs, without gradients except through the scores."""
+    from devo import projective_ops as pops
+
+    local = graph.scored
+    edges = graph.select(local)
+    with torch.no_grad():
+        coords = pops.transform(clips.poses, clips.patches, clips.intrinsics, *edges)
+    chosen = weight.detach().view(clips.clips, -1, 2)[:, local].reshape(1, -1, 2)
+    return (clips.scores, graph.valid[:, local].reshape(1, -1), coords,
+            graph.coords_gt[:, local].reshape(1, -1, *graph.coords_gt.shape[2:]), chosen, edges[2],
+            graph.distance[local].repeat(clips.clips))
+
+
+def _probe(clips: JoinedClips) -> ProbeResult:
+    """Match each frame's patches with one other frame of its clip, from a zero state and without motion.
+
+    This is what the tracker does to find out whether the camera moved at all, before anything is known.
+    """
+    from devo import projective_ops as pops
+
+    device = clips.patches.device
+    source = torch.arange(clips.frames, device=device)
+    reach = max(1, min(3, clips.frames - 1))
+    step = torch.randint(1, reach + 1, (clips.frames,)).to(device)
+    step = torch.where(torch.rand(clips.frames).to(device) < 0.75, step, -step)
+    other = source + step
+    other = torch.where((other < 0) | (other >= clips.frames), source - step, other)
+    kk = torch.arange(clips.frames * clips.per_frame, device=device)
+    ii, jj, kk = clips.edges(kk // clips.per_frame, other.repeat_interleave(clips.per_frame), kk)
+    coords = clips.patches_gt[:, kk, :2].permute(0, 1, 3, 4, 2)
+    net = clips.context.new_zeros(1, len(kk), clips.context.shape[1], dtype=torch.float32)
+    from devo.edges import EdgeGroups
+
+    _, delta, _ = clips.update(net, coords, ii, jj, kk, EdgeGroups.build(ii, jj, kk))
+    truth, _, visible = clips.truth(ii, jj, kk)
+    middle = coords.shape[2] // 2
+    centre = coords[:, :, middle, middle]
+    return ProbeResult(centre + delta, truth[:, :, middle, middle], visible, centre)
+
+
+def _check_shapes(images: Tensor, disps: Tensor, intrinsics: Tensor) -> None:
+    if images.dim() != 5 or images.shape[-1] % 4 or images.shape[-2] % 4:
+        raise InputError(f"images have shape {tuple(images.shape)}; expected (clips, frames, channels, H, W) with H and W "
+                         "multiples of 4, so crop or pad them")
+    clips, frames, _, height, width = images.shape
+    for name, value, expected in (("disps", disps, (clips, frames, height, width)), ("intrinsics", intrinsics, (clips, frames, 4))):
+        if tuple(value.shape) != expected:
+            raise InputError(f"{name} has shape {tuple(value.shape)}; expected {expected} to match the images")

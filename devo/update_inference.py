@@ -1,0 +1,149 @@
+"""The update operator without gradients: chunks of edges whose temporaries stay in the cache.
+
+Two passes over the edges. The first takes the edges sorted by patch, in pieces of whole patches: correlation MLP,
+exchange with the temporal neighbours (which are the neighbouring rows in that order) and pooling per patch. The second takes
+them sorted by frame pair: pooling per pair, gated residuals and output heads. Between the passes only the
+hidden state is kept, in the tensor that becomes the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from devo.edges import EdgeGroups, Segments
+
+if TYPE_CHECKING:
+    from devo.blocks import GatedResidual, SoftAgg
+    from devo.update import Update
+
+# values per temporary of a chunk: 1 MB of float32, half the second-level cache of a current server core
+CHUNK_VALUES = 2048 * 128
+CUDA_CHUNK_ROWS = 65536
+
+
+class _Piece:
+    """Rows of one chunk: edges sorted by group, with group numbers counted from 0 inside the chunk."""
+
+    def __init__(self, segments: Segments, bounds: tuple[int, int, int, int]) -> None:
+        first, last, first_group, last_group = bounds
+        self.rows = segments.order[first:last]
+        self.label = segments.label.index_select(0, self.rows) - first_group
+        self.count = last_group - first_group
+        starts = segments.start[first_group : last_group + 1] - first
+        self.heads, self.tails = starts[:-1], starts[1:] - 1
+
+
+def _pieces(segments: Segments, rows: int) -> Iterator[_Piece]:
+    for bounds in segments.chunks(rows):
+        yield _Piece(segments, bounds)
+
+
+class _Layers:
+    """Weights of the update operator, cast once per call to the type of the matrix products."""
+
+    def __init__(self, update: Update, dtype: torch.dtype) -> None:
+        self.dtype = dtype
+        self._cast = {
+            module: (module.weight.to(dtype), None if module.bias is None else module.bias.to(dtype))
+            for module in update.modules()
+            if isinstance(module, nn.Linear | nn.LayerNorm)
+        }
+
+    def linear(self, x: Tensor, module: nn.Module) -> Tensor:
+        """`x @ weight.T + bias` of a linear layer, `x` already in the right type."""
+        weight, bias = self._cast[module]
+        return functional.linear(x, weight, bias)
+
+    def mlp(self, x: Tensor, chain: nn.Sequential) -> Tensor:
+        """Linear, ReLU, linear."""
+        return self.linear(self.linear(x, chain[0]).relu_(), chain[2])
+
+    def correlation(self, x: Tensor, chain: nn.Sequential) -> Tensor:
+        """The correlation MLP, all of it in the type of the matrix products."""
+        x = self.mlp(x.to(self.dtype), chain)
+        weight, bias = self._cast[chain[3]]
+        return self.linear(functional.layer_norm(x, weight.shape, weight, bias, chain[3].eps).relu_(), chain[5])
+
+    def soft_aggregation_(self, x: Tensor, module: SoftAgg, piece: _Piece) -> Tensor:
+        """Add the pooled and redistributed features of each group to `x` (R, dim) float32, in place."""
+        lowered = x.to(self.dtype)
+        score = self.linear(lowered, module.g).to(x.dtype)
+        index = piece.label[:, None].expand_as(score)
+        peak = x.new_full((piece.count, x.shape[1]), -torch.inf).scatter_reduce_(0, index, score, "amax")
+        weight = score.sub_(peak.index_select(0, piece.label)).exp_()
+        total = torch.zeros_like(peak).scatter_add_(0, index, weight)
+        pooled = torch.zeros_like(peak).scatter_add_(0, index, weight.mul_(self.linear(lowered, module.f)))
+        handed_back = self.linear(pooled.div_(total).to(self.dtype), module.h).to(x.dtype)
+        return x.add_(handed_back.index_select(0, piece.label))
+
+    def gated_residual_(self, x: Tensor, module: GatedResidual) -> Tensor:
+        """`x + sigmoid(gate(x)) * res(x)` in place."""
+        lowered = x.to(self.dtype)
+        gate = self.linear(lowered, module.gate[0]).sigmoid_()
+        return x.add_(gate.mul_(self.mlp(lowered, module.res)))
+
+
+def _norm(x: Tensor, module: nn.LayerNorm) -> Tensor:
+    return functional.layer_norm(x, (x.shape[-1],), module.weight, module.bias, module.eps)
+
+
+def _exchange_(x: Tensor, update: Update, layers: _Layers, piece: _Piece) -> Tensor:
+    """Hand each edge its predecessor through `c1`, then its successor through `c2`; a missing one counts as zero."""
+    shifted = torch.empty(x.shape, dtype=layers.dtype, device=x.device)
+    shifted[1:] = x[:-1]
+    x.add_(layers.mlp(shifted.index_fill_(0, piece.heads, 0), update.c1))
+    shifted[:-1] = x[1:]
+    return x.add_(layers.mlp(shifted.index_fill_(0, piece.tails, 0), update.c2))
+
+
+def matmul_dtype(reference: Tensor) -> torch.dtype:
+    """The autocast type of the device of `reference` while autocast is on, else its own type."""
+    device = reference.device.type
+    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else reference.dtype
+
+
+@torch.no_grad()
+def update_in_chunks(
+    update: Update, net: Tensor, inp: Tensor, corr: Tensor, groups: EdgeGroups, chunk_rows: int | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Run the update operator without gradients.
+
+    Args:
+        update: the operator.
+        net: (E, dim) hidden state.
+        inp: (E, dim) context, any floating dtype.
+        corr: (E, 98*P*P) correlation features, any floating dtype.
+        groups: structure of the graph.
+        chunk_rows: edges per chunk, chosen from `dim` if omitted; the result depends on it by rounding only.
+
+    Returns:
+        New hidden state (E, dim), revision (E, 2) and confidence (E, 2), all in the dtype of the weights (float32).
+    """
+    dtype = matmul_dtype(update.norm.weight)
+    if chunk_rows is None:
+        chunk_rows = CUDA_CHUNK_ROWS if net.is_cuda else max(256, CHUNK_VALUES // update.dim)
+    full = update.norm.weight.dtype
+    with torch.autocast(net.device.type, enabled=False):
+        layers = _Layers(update, dtype)
+        state = torch.empty(net.shape, dtype=full, device=net.device)
+        for piece in _pieces(groups.patch, chunk_rows):
+            x = net.index_select(0, piece.rows).to(full)
+            x += inp.index_select(0, piece.rows)
+            x += layers.correlation(corr.index_select(0, piece.rows), update.corr)
+            x = _exchange_(_norm(x, update.norm), update, layers, piece)
+            state.index_copy_(0, piece.rows, layers.soft_aggregation_(x, update.agg_kk, piece))
+        heads_weight = torch.cat([update.d[1].weight, update.w[1].weight])
+        heads_bias = torch.cat([update.d[1].bias, update.w[1].bias])
+        heads = torch.empty(len(net), 4, dtype=full, device=net.device)
+        for piece in _pieces(groups.frame_pair, chunk_rows):
+            x = layers.soft_aggregation_(state.index_select(0, piece.rows), update.agg_ij, piece)
+            for norm, gated in ((update.gru[0], update.gru[1]), (update.gru[2], update.gru[3])):
+                x = layers.gated_residual_(_norm(x, norm), gated)
+            state.index_copy_(0, piece.rows, x)
+            heads.index_copy_(0, piece.rows, functional.linear(x.relu_(), heads_weight, heads_bias))
+    return state, heads[:, :2].contiguous(), heads[:, 2:].sigmoid()

@@ -1,0 +1,1 @@
+"""Measuring: trajectories, clouds, speed."""

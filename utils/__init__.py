@@ -1,0 +1,1 @@
+"""Event files, datasets, voxel grids, drivers and clouds: everything around the odometry."""

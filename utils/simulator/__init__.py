@@ -1,0 +1,1 @@
+"""Event-camera simulator with exact ground truth: textured planes, smooth motion, contrast-threshold events."""

@@ -1,0 +1,1 @@
+"""Training of the event network: clip pool, augmentation, losses of one step, validation, the loop around them."""

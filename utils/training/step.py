@@ -1,0 +1,131 @@
+"""One training step: unroll the network over a batch of clips and add up the losses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from devo.data_readers.base import TrainingClips
+from devo.enet import eVONet
+from devo.lietorch import SE3
+from devo.losses import direct_loss, flow_errors, flow_loss, masked_mean, pose_loss, score_loss
+from devo.unroll import UnrollResult, UnrollStep, unroll_clips
+from devo.unroll_state import UnrollSettings
+from utils.training.settings import LossSettings, TrainSettings
+
+PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+
+@dataclass(frozen=True)
+class StepPlan:
+    """What is drawn at random for one step.
+
+    Attributes:
+        structure_only: poses stay at the truth.
+        start_fraction: (B,) where each clip's poses start between identity (0) and truth (1).
+        published_weight: factor of the flow and pose losses, 0..1.
+        train_scorer: the scorer gets its loss in this step.
+    """
+
+    structure_only: bool
+    start_fraction: Tensor
+    published_weight: float
+    train_scorer: bool
+
+
+def plan_step(settings: TrainSettings, step: int, generator: torch.Generator) -> StepPlan:
+    """Draw the start mode of a step."""
+    structure_only = float(torch.rand((), generator=generator)) < settings.structure_only
+    perturbed = torch.rand(settings.clips, generator=generator) < settings.perturbed
+    fraction = torch.rand(settings.clips, generator=generator) * perturbed
+    ramp = settings.loss.published_from
+    weight = 1.0 if ramp <= 0 else min(1.0, max(0.0, (step - ramp) / ramp))
+    return StepPlan(structure_only, fraction, weight, step % settings.score_every == 0)
+
+
+class TrainingStep(nn.Module):
+    """Network and losses as one module, so that distributed training can wrap it."""
+
+    def __init__(self, network: eVONet, settings: TrainSettings) -> None:
+        super().__init__()
+        self.network = network
+        self.settings = settings
+
+    def unroll_settings(self, structure_only: bool = False) -> UnrollSettings:
+        """The graph schedule of training steps."""
+        wanted = self.settings
+        return UnrollSettings(
+            steps=wanted.updates, patches_per_image=wanted.patches, structure_only=structure_only,
+            initial_frames=wanted.initial_frames, solver_gradient_every=wanted.solver_gradient_every,
+            probe=wanted.loss.probe > 0, mixed_precision=PRECISIONS[wanted.precision])
+
+    def forward(self, clips: TrainingClips, plan: StepPlan) -> dict[str, Tensor]:
+        """Total loss (key `total`) and its parts (without gradient) for a batch on the network's device."""
+        images = self.network.normalize(clips.voxels)
+        poses = SE3(clips.world_T_cam).inv()
+        result = unroll_clips(self.network, images, poses, clips.inv_depths, clips.intrinsics,
+                              self.unroll_settings(plan.structure_only), plan.start_fraction.to(images.device))
+        return total_loss(result, self.settings.loss, plan)
+
+
+def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> dict[str, Tensor]:
+    """Weighted sum of all losses of an unrolled batch, see `LossSettings`; parts are means over the updates."""
+    parts: dict[str, list[Tensor]] = {name: [] for name in ("flow", "pose", "direct", "confidence")}
+    total = result.steps[0].predicted.new_zeros(())
+    for number, step in enumerate(result.steps):
+        direct = direct_loss(step.predicted, step.predicted_gt, step.predicted_valid)
+        total = total + weights.direct * (weights.direct_first if number == 0 else 1.0) * direct
+        parts["direct"].append(direct)
+        if weights.confidence > 0:
+            confidence = confidence_loss(step, weights.confidence_pixels)
+            total = total + weights.confidence * confidence
+            parts["confidence"].append(confidence)
+        if step.coords is None or plan.published_weight == 0:
+            continue
+        flow = flow_loss(step.coords, step.coords_gt, step.valid)
+        parts["flow"].append(flow)
+        total = total + plan.published_weight * weights.flow * flow
+        if number >= 2 and not plan.structure_only and step.poses is not None:
+            frames = step.poses.shape[1]
+            pose = pose_loss(step.poses.data, result.poses_gt.data[:, :frames])[0]
+            parts["pose"].append(pose)
+            total = total + plan.published_weight * weights.pose * pose
+    if result.probe is not None and weights.probe > 0:
+        probe = direct_loss(result.probe.predicted, result.probe.predicted_gt, result.probe.predicted_valid)
+        total = total + weights.probe * probe
+        parts["probe"] = [probe]
+    scores = last_score_loss(result.steps[-1])
+    if scores is not None and plan.train_scorer:
+        total = total + weights.scores * scores
+        parts["scores"] = [scores]
+    report = {name: torch.stack(values).detach().mean() for name, values in parts.items() if values}
+    report["direct_first"] = parts["direct"][0].detach()
+    report["direct_last"] = parts["direct"][-1].detach()
+    if parts["flow"]:
+        report["flow_last"] = parts["flow"][-1].detach()
+    return {"total": total, **report}
+
+
+def confidence_loss(step: UnrollStep, pixels: float) -> Tensor:
+    """Cross entropy between the confidence and exp(-(error/pixels)^2) of the centres before bundle adjustment."""
+    error = (step.predicted.detach() - step.predicted_gt).abs()
+    wanted = torch.exp(-(error / pixels).square())
+    wanted = torch.where(step.predicted_valid[..., None], wanted, 0.0)
+    return F.binary_cross_entropy(step.weight.clamp(1e-6, 1 - 1e-6), wanted, reduction="mean")
+
+
+def last_score_loss(step: UnrollStep) -> Tensor | None:
+    """Scorer loss of the last update; None where the network has no scorer or it was not run with gradient."""
+    if step.scores is None or not step.scores.requires_grad and torch.is_grad_enabled():
+        return None
+    if step.coords_full is None or step.coords_gt_full is None or step.weight_full is None:
+        return None
+    assert step.valid_full is not None and step.kk_full is not None
+    errors = flow_errors(step.coords_full, step.coords_gt_full)
+    return score_loss(step.scores, errors, step.weight_full, step.valid_full, step.kk_full)
+
+
+__all__ = ["PRECISIONS", "StepPlan", "TrainingStep", "masked_mean", "plan_step", "total_loss"]
