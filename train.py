@@ -29,7 +29,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--validation-clips", type=int, default=32)
     group = parser.add_argument_group("training (default: preset)")
     for flag, kind in (("steps", int), ("clips", int), ("frames", int), ("updates", int), ("patches", int), ("initial-frames", int),
-                       ("structure-only", float), ("perturbed", float), ("solver-gradient-every", int), ("score-every", int),
+                       ("structure-only", float), ("perturbed", float), ("solver-gradient-every", int), ("match-gradient-every", int), ("score-every", int),
                        ("warmup", int), ("schedule", str), ("final-rate", float), ("ema", float), ("precision", str), ("seed", int),
                        ("pool-shards", int), ("shard-clips", int), ("shard-frames", int), ("reuse", int), ("norm", str)):
         group.add_argument(f"--{flag}", type=kind, default=None)

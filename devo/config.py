@@ -43,6 +43,9 @@ DEFAULTS: dict[str, Any] = {
     "MIXED_PRECISION": True,
     # frames whose features are kept; 0 = max(32, REMOVAL_WINDOW + PATCH_LIFETIME), 32 = as published
     "RING_SIZE": 0,
+    # inverse depth of new patches before initialisation; 0 = random in (0,1) as published, which on scenes with little
+    # relief often ends in the mirrored solution (scene and motion inverted)
+    "INITIAL_INV_DEPTH": 0.5,
     # keep the principal point when columns are cropped, as the published 346-px results did
     "LEGACY_PRINCIPAL_POINT": False,
     # accepted for old frame-network files, has no effect
@@ -52,6 +55,7 @@ DEFAULTS: dict[str, Any] = {
 _AT_LEAST = {
     "BUFFER_SIZE": 9, "PATCHES_PER_FRAME": 1, "REMOVAL_WINDOW": 1, "OPTIMIZATION_WINDOW": 1, "PATCH_LIFETIME": 1,
     "KEYFRAME_INDEX": 2, "KEYFRAME_THRESH": 0.0, "MOTION_DAMPING": 0.0, "RING_SIZE": 0,
+    "INITIAL_INV_DEPTH": 0.0,
 }
 
 

@@ -222,12 +222,17 @@ class DEVO(PatchGraph):
         self.colors_[n] = ((color.float() + 0.5) * 127.5).clamp(0, 255).to(torch.uint8)
         if n > 0:
             self.poses_[n] = self._predict_pose()
-        inv_depth = torch.rand_like(patches[:, :, 2, 0, 0, None, None].float())
+        patches = patches[0].float().clone()
+        patches[:, 2] = self._initial_inv_depths()
+        self.patches_[n] = patches
+
+    def _initial_inv_depths(self) -> Tensor:
+        """Inverse depths of a new frame's patches, `(M,1,1)`: the median of the last three keyframes once there is one."""
+        start = self.patches_[0, :, 2, :1, :1]
         if self.is_initialized:
-            inv_depth = torch.full_like(inv_depth, float(self.patches_[n - 3:n, :, 2].median()))
-        patches = patches.float().clone()
-        patches[:, :, 2] = inv_depth
-        self.patches_[n] = patches[0]
+            return torch.full_like(start, float(self.patches_[self.n - 3:self.n, :, 2].median()))
+        constant = getattr(self.cfg, "INITIAL_INV_DEPTH", 0.0)
+        return torch.full_like(start, constant) if constant > 0 else torch.rand_like(start)
 
     def _predict_pose(self) -> Tensor:
         previous = SE3(self.poses_[self.n - 1])

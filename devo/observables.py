@@ -111,7 +111,7 @@ def _point_quality(tracker: DEVO, edges: EdgeRecords) -> dict[str, Tensor]:
         "observations": count,
         "mean_weight": weight_sum / count.clamp(min=1.0),
         "information": torch.zeros(m, device=device).index_add_(0, patch, information[valid]),
-        "parallax": torch.zeros(m, device=device).index_reduce_(0, patch, parallax[valid], "amax"),
+        "parallax": torch.zeros(m, device=device).scatter_reduce_(0, patch, parallax[valid], "amax"),
         "residual": _segment_median(residual[valid], patch, m),
     }
 

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from devo.altcorr import patchify
 from devo.errors import InputError
-from devo.extractor import BasicEncoder4
+from devo.extractor import BasicEncoder4, channels_last_frames
 from devo.selector import PatchSelector, Scorer, event_gradient
 
 SELECTORS = ("scorer", "gradient", "random")
@@ -87,10 +87,9 @@ class Patchifier(nn.Module):
             raise InputError(
                 f"images have shape {tuple(images.shape)}; this network expects (B, n, {self.channels}, H, W)"
             )
-        images = images.flatten(0, 1)[None]
-        fmap = self.fnet(images) / FEATURE_SCALE
-        context = self.inet(images) / FEATURE_SCALE
-        frames, height, width = fmap.shape[1], fmap.shape[3], fmap.shape[4]
+        images = channels_last_frames(images)
+        fmap = self.fnet.encode(images) / FEATURE_SCALE
+        frames, _, height, width = fmap.shape
         if coords is None:
             method, grid = scorer_eval_mode, scorer_eval_use_grid
             x, y, scores = self._select(images, (height, width), patches_per_image, method, grid, generator)
@@ -99,14 +98,16 @@ class Patchifier(nn.Module):
             coords = self._checked(coords, (frames, height, width))
             scores = self._scores_at(images, coords) if self.training and self.patch_selector == "scorer" else None
         radius = self.patch_size // 2
-        gmap = patchify(fmap[0], coords, radius).flatten(0, 1)[None]
-        imap = patchify(context[0], coords, 0).flatten(0, 1)[None]
+        gmap = patchify(fmap, coords, radius).flatten(0, 1)[None]
+        # the last convolution of inet is pointwise: only the pixels of the patches need it
+        context = patchify(self.inet.trunk(images), coords, 0).flatten(0, 1)
+        imap = self.inet.conv2(context)[None] / FEATURE_SCALE
         patches = patchify(self._grid(fmap, disps), coords, radius).flatten(0, 1)[None]
         index = torch.arange(frames, device=images.device).repeat_interleave(coords.shape[1])
         last = scores
         if not self.training:
             last = self._colors(images, coords) if return_color else None
-        return fmap, gmap, imap, patches, index, last
+        return fmap[None], gmap, imap, patches, index, last
 
     @staticmethod
     def _checked(coords: Tensor, size: tuple[int, int, int]) -> Tensor:
@@ -123,7 +124,7 @@ class Patchifier(nn.Module):
     @staticmethod
     def _grid(fmap: Tensor, disps: Tensor | None) -> Tensor:
         """Column, row and inverse depth of every feature pixel, `(N, 3, h, w)` float32."""
-        frames, height, width = fmap.shape[1], fmap.shape[3], fmap.shape[4]
+        frames, _, height, width = fmap.shape
         grid = torch.ones(frames, 3, height, width, device=fmap.device)
         grid[:, 0] = torch.arange(width, device=fmap.device)
         grid[:, 1] = torch.arange(height, device=fmap.device)[:, None]
@@ -145,7 +146,7 @@ class Patchifier(nn.Module):
         if min(height, width) < 3:
             found = f"{images.shape[-1]}x{images.shape[-2]} pixels"
             raise InputError(f"frames of {found} are too small; expected at least 9x9 (3x3 feature pixels)")
-        frames = images.shape[1]
+        frames = images.shape[0]
         if self.patch_selector == "random":
             x = torch.randint(1, width - 1, (frames, count), generator=generator, device=images.device)
             y = torch.randint(1, height - 1, (frames, count), generator=generator, device=images.device)
@@ -154,7 +155,7 @@ class Patchifier(nn.Module):
             selector = PatchSelector("3xrandom") if self.training else PatchSelector(method, grid)
             x, y = selector(event_gradient(images), count, generator)
             return x.clamp(1, width - 2), y.clamp(1, height - 2), None
-        scores = torch.sigmoid(self.scorer(images).float())
+        scores = torch.sigmoid(self.scorer.rate(images).float())
         if not self.training:
             x, y = PatchSelector(method, grid)(scores, count, generator)
             return x + 1, y + 1, None
@@ -162,12 +163,12 @@ class Patchifier(nn.Module):
         candidates = (frames, CANDIDATE_FACTOR * count)
         x = torch.randint(0, columns, candidates, generator=generator, device=images.device)
         y = torch.randint(0, rows, candidates, generator=generator, device=images.device)
-        value = scores[0].flatten(1).gather(1, y * columns + x)
+        value = scores.flatten(1).gather(1, y * columns + x)
         keep = value.argsort(dim=1, stable=True)[:, -count:]
         return x.gather(1, keep) + 1, y.gather(1, keep) + 1, value.gather(1, keep)
 
     def _scores_at(self, images: Tensor, coords: Tensor) -> Tensor:
-        scores = torch.sigmoid(self.scorer(images).float())[0]
+        scores = torch.sigmoid(self.scorer.rate(images).float())
         cell = (coords.long() - 1).clamp(min=0)
         rows, columns = scores.shape[-2:]
         x, y = cell[..., 0].clamp(max=columns - 1), cell[..., 1].clamp(max=rows - 1)
@@ -176,7 +177,7 @@ class Patchifier(nn.Module):
     def _colors(self, images: Tensor, coords: Tensor) -> Tensor:
         """Brightness of each patch centre, sampled at full-resolution pixel 4x+2: (1, N*M, 1 or 3)."""
         events = self.channels == EVENT_BINS
-        source = images[0].float()
+        source = images.float()
         if events:
             source = source.abs().sum(dim=1, keepdim=True)
         colors = patchify(source, FEATURE_SCALE * (coords + 0.5), 0).flatten(0, 1)[None, ..., 0, 0]

@@ -44,7 +44,7 @@ def normalize_poses_numpy(poses: Any) -> FloatArray:
 
     Raises `InputError` for another last dimension, numbers that are not finite and quaternions of length zero.
     """
-    array: FloatArray = np.array(poses, dtype=np.float64)
+    array: FloatArray = np.array(np.asarray(poses), dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != 7:
         raise InputError(f"found poses of shape {array.shape}, expected (..., 7): tx ty tz qx qy qz qw")
     _check_finite(array, 1, "pose")

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from devo.errors import InputError
+from devo.extractor import channels_last_frames
 
 GRID = 2
 KERNEL_SIZE = 4
@@ -40,20 +41,23 @@ class Scorer(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Map `(B, n, bins, H, W)` to logits `(B, n, (H-8)//4, (W-8)//4)`; the sigmoid is left to the caller."""
-        scores = self.scorer(images.flatten(0, 1))
-        return scores[:, 0].unflatten(0, images.shape[:2])
+        return self.rate(channels_last_frames(images)).unflatten(0, images.shape[:2])
+
+    def rate(self, frames: Tensor) -> Tensor:
+        """Map frames `(N, bins, H, W)`, channels last in memory, to logits `(N, (H-8)//4, (W-8)//4)`."""
+        return self.scorer(frames)[:, 0]
 
 
 def event_gradient(images: Tensor) -> Tensor:
     """Magnitude of the spatial gradient of the channel sum, averaged over 4x4 cells.
 
     Args:
-        images: `(B, n, C, H, W)`.
+        images: `(N, C, H, W)`.
 
     Returns:
-        `(B, n, (H-1)//4, (W-1)//4)`; cell s covers full-resolution pixels 4s..4s+3, quarter-resolution pixel s.
+        `(N, (H-1)//4, (W-1)//4)`; cell s covers full-resolution pixels 4s..4s+3, quarter-resolution pixel s.
     """
-    total = images.float().sum(dim=2)
+    total = images.float().sum(dim=1)
     dx = total[..., :-1, 1:] - total[..., :-1, :-1]
     dy = total[..., 1:, :-1] - total[..., :-1, :-1]
     return functional.avg_pool2d(torch.hypot(dx, dy), 4, 4)
@@ -89,12 +93,12 @@ class PatchSelector:
         """Pick `ppi` positions per map.
 
         Args:
-            scores: `(B, n, h, w)` non-negative scores.
+            scores: `(..., h, w)` non-negative scores, one map per frame.
             ppi: patches per map.
             generator: source of randomness, the global one if omitted.
 
         Returns:
-            x, y: each `(B*n, ppi)` int64, in [0, w-1] and [0, h-1].
+            x, y: each `(frames, ppi)` int64, in [0, w-1] and [0, h-1].
 
         Raises:
             InputError: the map has fewer cells than patches are asked for.

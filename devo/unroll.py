@@ -121,13 +121,14 @@ def unroll_clips(network: eVONet, images: Tensor, poses: SE3, disps: Tensor, int
             graph.grow()
         last = step == settings.steps - 1
         differentiable = last or step % settings.solver_gradient_every == 0
-        steps.append(_one_update(clips, graph, differentiable, last))
+        match = step % settings.match_gradient_every == 0
+        steps.append(_one_update(clips, graph, differentiable, match, last))
         clips.poses, clips.patches = clips.poses.detach(), clips.patches.detach()
     truth = type(clips.poses_gt)(clips.poses_gt.data.view(clips.clips, clips.frames, 7))
     return UnrollResult(steps, truth, _probe(clips) if settings.probe and clips.frames > 1 else None)
 
 
-def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, last: bool) -> UnrollStep:
+def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, match: bool, last: bool) -> UnrollStep:
     """Revise all edges once and solve for poses and depths; leaves the new state in `clips` and `graph`."""
     from devo import projective_ops as pops
     from devo.ba import BA
@@ -136,7 +137,7 @@ def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, l
     ii, jj, kk = graph.edges
     with torch.no_grad():
         coords = pops.transform(clips.poses, clips.patches, clips.intrinsics, ii, jj, kk)
-    net, delta, weight = clips.update(graph.net.reshape(1, len(kk), -1), coords, ii, jj, kk, graph.groups)
+    net, delta, weight = clips.update(graph.net.reshape(1, len(kk), -1), coords, ii, jj, kk, graph.groups, match)
     graph.net = net.view(graph.net.shape)
     middle = coords.shape[2] // 2
     centre = coords[:, :, middle, middle]
@@ -146,12 +147,12 @@ def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, l
         for _ in range(settings.solver_iterations):
             clips.poses, clips.patches = BA(
                 clips.poses, clips.patches, clips.intrinsics, target, weight, DEPTH_DAMPING, ii, jj, kk, bounds,
-                ep=SOLVER_DAMPING, fixedp=1, structure_only=settings.structure_only, clips=clips.clips)
+                ep=SOLVER_DAMPING, fixedp=1, structure_only=settings.structure_only, clips=clips.clips, blocks=graph.blocks)
     truth = graph.coords_gt[:, :, middle, middle].reshape(1, -1, 2)
     start_error = (centre - truth).norm(dim=-1)
     near = graph.select(graph.near)
     moved = pops.transform(clips.poses, clips.patches, clips.intrinsics, *near) if differentiable else None
-    full = _full_report(clips, graph, weight) if last else (None,) * 6
+    full = _full_report(clips, graph, weight) if last else (None,) * 7
     return UnrollStep(
         graph.valid[:, graph.near].reshape(1, -1), moved,
         graph.coords_gt[:, graph.near].reshape(1, -1, *graph.coords_gt.shape[2:]),

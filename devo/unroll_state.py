@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from devo.edges import EdgeGroups
+from devo.graph import pair_blocks
 
 if TYPE_CHECKING:
     from devo.enet import eVONet
@@ -33,6 +34,7 @@ class UnrollSettings:
         solver_iterations: Gauss-Newton steps per update.
         solver_gradient_every: 1: gradients flow through every bundle adjustment; k: through every k-th (and the last),
             the others only move the geometry.
+        match_gradient_every: the correlation features carry gradient to the encoders in every k-th update.
         probe: also run one update from a zero state on single edges between two frames, as the tracker's start-up does.
         mixed_precision: None (float32) or the type of autocast for encoders and update operator.
     """
@@ -46,6 +48,7 @@ class UnrollSettings:
     score_radius: int = 16
     solver_iterations: int = 2
     solver_gradient_every: int = 1
+    match_gradient_every: int = 1
     probe: bool = False
     mixed_precision: torch.dtype | None = None
 
@@ -55,7 +58,7 @@ class JoinedClips:
 
     def __init__(self, network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor,
                  settings: UnrollSettings) -> None:
-        from devo.altcorr import CorrBlock
+        from devo.corr_volume import CorrelationVolume
         from devo.lietorch import SE3
 
         self.clips, self.frames = images.shape[:2]
@@ -68,16 +71,16 @@ class JoinedClips:
             fmap, gmap, imap, patches, _, *rest = network.patchify(images, patches_per_image=self.per_frame, disps=disps)
         self.scores: Tensor | None = rest[0] if rest else None
         self.height, self.width = fmap.shape[-2:]
+        self.patches_gt = patches.detach().float()
+        self.patches = self._with_depth(torch.rand_like(self.patches_gt[:, :, :1, :1, :1]))
         fmap = fmap.float().reshape(1, flat, *fmap.shape[2:])
-        self.correlate = CorrBlock(fmap, gmap.float(), radius=3, dropout=0.2, levels=(1, 4))
+        self.correlate = CorrelationVolume(fmap, gmap.float(), self.clips, dtype=settings.mixed_precision or torch.float32)
         self.context = imap.reshape(flat * self.per_frame, -1)
         self.intrinsics = (intrinsics / network.RES).reshape(1, flat, 4)
-        self.patches_gt = patches.detach().float()
         self.nearest_point_free = -F.max_pool2d(-disps.reshape(flat, 1, *disps.shape[-2:]), 3, 1, 1)[:, 0]
         world = poses.data.reshape(self.clips, self.frames, 7)
         relative = SE3(world) * SE3(world[:, :1]).inv()  # the first frame of each clip is its world frame
         self.poses_gt = SE3(relative.data.reshape(1, flat, 7))
-        self.patches = self._with_depth(torch.rand_like(self.patches_gt[:, :, :1, :1, :1]))
         self.poses = self.poses_gt
 
     def autocast(self) -> contextlib.AbstractContextManager[object]:
@@ -147,11 +150,12 @@ class JoinedClips:
         valid = valid.bool()
         return coords, valid, valid & (inside & ~hidden)[None]
 
-    def update(self, net: Tensor, coords: Tensor, ii: Tensor, jj: Tensor, kk: Tensor,
-               groups: EdgeGroups) -> tuple[Tensor, Tensor, Tensor]:
+    def update(self, net: Tensor, coords: Tensor, ii: Tensor, jj: Tensor, kk: Tensor, groups: EdgeGroups,
+               match_gradient: bool = True) -> tuple[Tensor, Tensor, Tensor]:
         """One update of the hidden state, `(net, delta, weight)`, at reprojections (1,E,P,P,2)."""
+        with contextlib.nullcontext() if match_gradient else torch.no_grad():
+            corr = self.correlate(kk, jj, coords.permute(0, 1, 4, 2, 3))
         with self.autocast():
-            corr = self.correlate(kk, jj, coords.permute(0, 1, 4, 2, 3).contiguous())
             context = self.context.index_select(0, kk)[None]
             net, (delta, weight, _) = self.network.update(net, context, corr, None, ii, jj, kk, groups=groups)
         return net.float(), delta.float(), weight.float()
@@ -212,6 +216,7 @@ class GrowingGraph:
         settings = self.source.settings
         self.edges = self.source.edges(self.ii, self.jj, self.kk)
         self.groups = EdgeGroups.build(*self.edges)
+        self.blocks = pair_blocks(self.edges[0], self.edges[1])
         distance = (self.ii - self.jj).abs()
         self.near = ((distance > 0) & (distance <= settings.flow_radius)).nonzero()[:, 0]
         self.scored = ((distance > 0) & (distance <= settings.score_radius)).nonzero()[:, 0]

@@ -1,8 +1,23 @@
 """The one table of numeric tolerances, each with the worst case observed when it was set (2 cores, torch 2.13 CPU)."""
 
 # --- lie groups ---------------------------------------------------------------------------------------------
+LIE_PARITY = 1e-9  # reference arrays, float64; observed 1.4e-14
+LIE_LAWS_FLOAT64 = 1e-13  # group laws at angles 0 .. pi - 1e-6, absolute + relative; observed 1.5e-15
+LIE_LAWS_FLOAT32 = 5e-6  # the same in float32; observed 9.4e-7
+LIE_FLOAT32_SMALL = 1e-6  # float32 against float64 at angles 0 .. 1, values and gradients; observed 4.1e-7
+LIE_GRADIENT = 1e-10  # gradients against fourth-order differences, float64; observed 6.0e-12
+LIE_SLOPE = 1e-8  # second-order differences with steps of 1e-5, float64
 
 # --- geometry and bundle adjustment -------------------------------------------------------------------------
+TRANSFORM = 1e-4  # of the largest value; pixels 2.2e-7, Jacobians 3.5e-7
+REPROJECTION = 1e-5  # pixels relative to 1 + |pixel|; 3.0e-6
+REPROJECT_EDGES = 1e-5  # of the largest pixel, against transform; 2.2e-7
+BA_ONE_STEP = 1e-4  # poses; 5.5e-5
+# Depths after one step: 2.8e-4. The free scale has an eigenvalue of 6 beside 3.5e5, so the float32 reference itself is
+# uncertain there: its formulas in float32 with another order of summation differ from it by 3.6e-4, in float64 by 2.8e-4.
+BA_ONE_STEP_DEPTHS = 5e-4
+BA_TWO_STEPS = 1e-3  # poses 9.4e-5, depths 8.2e-4
+BA_DENSE_STEP = 1e-7  # float64, against a dense system with numeric Jacobian
 
 # --- correlation --------------------------------------------------------------------------------------------
 
@@ -13,7 +28,14 @@ TRACKER_ORACLE_POSES = 5e-3  # a change of 1e-6 in the initial inverse depths mo
 TRACKER_ORACLE_POINTS = 1e-2  # of the depth
 
 # --- events and voxel grids ---------------------------------------------------------------------------------
+VOXEL = 1e-6  # absolute, per cell of a few events
+VOXEL_RECTIFIED = 1e-6
 
 # --- clouds and trajectories --------------------------------------------------------------------------------
+UMEYAMA_AGAINST_EVO = 1e-9  # 100 random pairs, rotation, translation and scale: worst 0.0
 
 # --- simulator ----------------------------------------------------------------------------------------------
+
+# --- training -----------------------------------------------------------------------------------------------
+CORRELATION_VOLUME = 1e-4  # volume against direct correlation, values up to 40 and gradients; observed 1e-5
+JOINED_CLIPS = 1e-3  # joined against single clips after 4 updates, pixels and poses; observed below 1e-4

@@ -42,7 +42,7 @@ def BA(  # noqa: N802 - the published name
     be factorised or whose step is not finite changes nothing and ends the solver with `success=False`.
 
     Args:
-        poses: (1,N,7) or (N,7) tensor, or an object such as `SE3` whose `.data` is one; world->camera. Changed in place.
+        poses: (1,N,7) or (N,7) tensor, or an object such as `SE3` with one as `.data`; world->camera. Changed in place.
         patches: (1,K,3,P,P) or (K,3,P,P), channels x, y (feature-map pixels), inverse depth. Changed in place.
         intrinsics: (1,N,4) or (N,4) `fx fy cx cy` in feature-map pixels.
         target: (1,E,2) measured position of each patch centre in frame jj, pixels.

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
+from torch.linalg import cross
 
 from devo.lietorch import formulas
 from devo.lietorch.formulas import adj_transposed, small_adj_transposed
@@ -217,12 +218,13 @@ class _FromVec(Function):
         (x,) = ctx.saved_tensors
         layout: Layout = ctx.layout
         q = layout.quaternion(x)
+        grad = layout.tangent_gradient(grad)
         phi = layout.phi(grad)
-        grad_scale = grad[..., layout.start + 3 : layout.start + 4]
+        grad_scale = grad[..., -1:]
         parts: list[Tensor] = []
         if layout.has_translation:
             t, tau = layout.translation(x), grad[..., :3]
-            phi = phi - torch.linalg.cross(t, tau)
+            phi = phi - cross(t, tau)
             grad_scale = grad_scale - (t * tau).sum(-1, keepdim=True)
             parts.append(tau)
         pure = torch.constant_pad_nd(phi, (0, 1))
@@ -249,12 +251,12 @@ class _Convert(Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Gradients:
         source, target = ctx.layouts
-        parts = [target.phi(grad)[..., :3]]
+        grad = target.tangent_gradient(grad)
+        parts = [target.phi(grad)]
         if source.has_translation:
             parts.insert(0, grad[..., :3] if target.has_translation else torch.zeros_like(parts[0]))
         if source.has_scale:
-            sigma = grad[..., target.start + 3 : target.start + 4]
-            parts.append(sigma if target.has_scale else torch.zeros_like(sigma))
+            parts.append(grad[..., -1:] if target.has_scale else torch.zeros_like(parts[0][..., :1]))
         return None, None, source.element_gradient(torch.cat(parts, -1))
 
 

@@ -17,6 +17,7 @@ from torch.linalg import cross
 from devo.lietorch.layout import Layout, dot, join
 from devo.lietorch.quaternion import (
     apply_matrix,
+    cos_sin,
     precise_matmul,
     quat_conjugate,
     quat_multiply,
@@ -42,10 +43,10 @@ def matrix(layout: Layout, data: Tensor) -> Tensor:
 def exp(layout: Layout, tangent: Tensor) -> Tensor:
     """Exponential map: tangents (..., K) to elements (..., N)."""
     phi = layout.phi(tangent)
-    theta2 = dot(phi, phi)
-    theta = theta2.sqrt()
+    theta = torch.linalg.vector_norm(phi, dim=-1, keepdim=True)
+    theta2 = theta * theta
     imag = torch.sinc(theta * (0.5 / math.pi)) * 0.5  # sin(theta / 2) / theta
-    real = torch.cos(theta * 0.5)
+    real, _ = cos_sin(theta * 0.5)
     parts = [imag * phi, real]
     scale = tangent[..., -1:].exp() if layout.has_scale else None
     if layout.has_translation:
@@ -88,7 +89,7 @@ def log(layout: Layout, data: Tensor) -> Tensor:
     q = layout.quaternion(data)
     vector, w = q[..., :3], q[..., 3:]
     length = torch.linalg.vector_norm(vector, dim=-1, keepdim=True).clamp_min(TINY)
-    half = torch.atan(length / w)  # the division by w = 0 gives an infinity and the right angle
+    half = torch.atan2(length.copysign(w), w.abs())  # atan(length / w), with a right angle at w = 0
     per_length = half / length
     phi = 2 * per_length * vector
     parts = [phi]
@@ -110,7 +111,7 @@ def log(layout: Layout, data: Tensor) -> Tensor:
 def _inverse_phi1(scale: Tensor, half: Tensor, theta2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """As `_phi1` for 1 / f(z), which belongs to the inverse of W."""
     imag = 0.5 * torch.sinc(half / math.pi)
-    straight, turn, axis = _phi1(scale.log(), scale, theta2, 2 * imag * torch.cos(half), 2 * imag * imag)
+    straight, turn, axis = _phi1(scale.log(), scale, theta2, 2 * imag * cos_sin(half)[0], 2 * imag * imag)
     size = straight * straight + theta2 * turn * turn
     return straight / size, -turn / size, 1 / axis
 

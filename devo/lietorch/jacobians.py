@@ -1,7 +1,7 @@
 """Left Jacobians of the exponential map, J(a) = sum ad(a)^n / (n + 1)!, their inverses and transposes, times vectors.
 
 SO3 and SE3 in closed form (Barfoot 2017, ch. 7; the SE3 block Q is the derivative of the SO3 Jacobian along tau), with
-series below one radian; Sim3 through a matrix exponential. Plain differentiable torch; values and
+series below one radian; Sim3 as a matrix series. Plain differentiable torch; values and
 derivatives are finite at zero.
 """
 
@@ -13,11 +13,10 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
-from torch.linalg import cross
 
 from devo.lietorch.formulas import small_adj_transposed
 from devo.lietorch.layout import SO3_LAYOUT, Layout, dot, join
-from devo.lietorch.quaternion import precise_matmul
+from devo.lietorch.quaternion import cos_sin, hat, precise_matmul
 
 _TERMS = 12  # for one radian: the forward series then ends at 1e-22, the Bernoulli series of the inverse at 1e-18
 _SERIES_BELOW = 1.0  # squared angle
@@ -60,15 +59,15 @@ def _coefficients(x: Tensor, inverse: bool) -> tuple[Tensor | float, Tensor, Ten
     small = x < _SERIES_BELOW
     series = _evaluate_series(x.masked_fill(~small, 0.0), inverse)
     x = x.masked_fill(small, 1.0)
-    theta = x.sqrt()
-    imag = torch.sin(0.5 * theta) / theta
+    theta = x * x.rsqrt()  # not Tensor.sqrt, for the reason given at cos_sin
+    real, imag = cos_sin(0.5 * theta)
+    imag = imag / theta
     if inverse:
-        half_cot = 0.5 * torch.cos(0.5 * theta) / imag
+        half_cot = 0.5 * real / imag
         even = (1 - half_cot) / x
         slope = (half_cot - 0.25 / (imag * imag)) / x
         b, db = (torch.where(small, s, c) for s, c in zip(series, (even, (-slope - 2 * even) / x)))
         return -0.5, b, 0.0, db
-    real = torch.cos(0.5 * theta)
     sinc, odd = 2 * imag * real, 2 * imag * imag
     even = (1 - sinc) / x
     slope = (1 - x * odd - sinc) / x
@@ -81,34 +80,51 @@ def _apply_se3(layout: Layout, tangent: Tensor, vector: Tensor, inverse: bool, t
     """`left_jacobian` of SE3, whose matrix is [[J, Q], [0, J]], and of SO3, where it is J."""
     phi = layout.phi(tangent)
     a, b, da, db = _coefficients(dot(phi, phi), inverse)
-    sign = -1.0 if transposed else 1.0  # J(a)^T = J(-a), which flips the odd terms
-
-    def rotational(v: Tensor) -> tuple[Tensor, Tensor]:
-        turned = cross(phi, v)
-        return v + sign * a * turned + cross(phi, b * turned), turned
-
+    # J(a)^T = J(-a), which flips the odd terms. Products of rows with this matrix are products phi x v.
+    sign = -1.0 if transposed else 1.0
+    turn = hat(phi).mT
+    vectors = vector.unflatten(-1, (-1, 3))
+    turned = precise_matmul(vectors, turn)
+    rotational = vectors + sign * _per_row(a) * turned + precise_matmul(_per_row(b) * turned, turn)
     if not layout.has_translation:
-        return rotational(vector)[0]
-    tau = tangent[..., :3]
-    first, first_turned = rotational(vector[..., :3])
-    second, second_turned = rotational(vector[..., 3:])
-    v, turned = (vector[..., :3], first_turned) if transposed else (vector[..., 3:], second_turned)
-    along, moved = dot(phi, tau), cross(tau, v)
+        return rotational.squeeze(-2)
+    # The off-diagonal block takes its input from one half and adds its output to the other.
+    source = slice(0, 1) if transposed else slice(1, 2)
+    shift = hat(tangent[..., :3]).mT
+    moved, turned = precise_matmul(vectors[..., source, :], shift), turned[..., source, :]
+    along = dot(phi, tangent[..., :3])
     coupling = (
-        sign * (a * moved + along * da * turned)
-        + cross(phi, b * moved + along * db * turned)
-        + cross(tau, b * turned)
-    )  # fmt: skip
-    return torch.cat((first, second + coupling) if transposed else (first + coupling, second), -1)
+        sign * (_per_row(a) * moved + _per_row(along * da) * turned)
+        + precise_matmul(_per_row(b) * moved + _per_row(along * db) * turned, turn)
+        + precise_matmul(_per_row(b) * turned, shift)
+    )
+    first, second = rotational.split(1, -2)
+    parts = (first, second + coupling) if transposed else (first + coupling, second)
+    return torch.cat(parts, -2).flatten(-2)
+
+
+def _per_row(coefficient: Tensor | float) -> Tensor | float:
+    return coefficient if isinstance(coefficient, float) else coefficient.unsqueeze(-1)
 
 
 def left_jacobian_matrix(layout: Layout, tangent: Tensor) -> Tensor:
-    """Left Jacobians (..., K, K) of tangents (..., K) of any size, from the exponential of [[ad, I], [0, 0]]."""
+    """Left Jacobians (..., K, K) of tangents (..., K) of any size: the series of a fraction A of ad, doubled again.
+
+    Doubling is J(2A) = J(A) (I + A J(A) / 2), which follows from exp(2A) - 1 = (exp(A) - 1)(exp(A) + 1).
+    """
     k = layout.tangent_dim
     identity = torch.eye(k, dtype=tangent.dtype, device=tangent.device)
     small_adj = small_adj_transposed(layout, tangent.unsqueeze(-2), identity.expand(*tangent.shape[:-1], k, k))
-    upper = torch.cat((small_adj, identity.expand_as(small_adj)), -1)
-    return torch.linalg.matrix_exp(torch.cat((upper, torch.zeros_like(upper)), -2))[..., :k, k:]
+    size = float(small_adj.detach().abs().sum(-1).max()) if small_adj.numel() else 0.0
+    doublings = max(0, math.ceil(math.log2(size / 0.5))) if 0.5 < size < math.inf else 0
+    fraction = small_adj * 0.5**doublings
+    jacobian = identity.expand_as(fraction)
+    for n in range(_TERMS + 2, 1, -1):
+        jacobian = identity + precise_matmul(fraction, jacobian) / n
+    for _ in range(doublings):
+        jacobian = jacobian + precise_matmul(precise_matmul(jacobian, fraction), jacobian) / 2
+        fraction = fraction * 2
+    return jacobian
 
 
 def left_jacobian(

@@ -50,7 +50,7 @@ class Layout:
         return data[..., -1:]
 
     def phi(self, tangent: Tensor) -> Tensor:
-        """Rotation part (..., 3) of tangents (..., K), in radians."""
+        """Rotation part (..., 3) of tangents (..., K), in radians; K-long, not the N-long element gradients."""
         return tangent[..., self.start : self.start + 3] if self.tangent_dim > 3 else tangent
 
     def tangent_gradient(self, grad: Tensor) -> Tensor:

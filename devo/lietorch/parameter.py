@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -37,3 +39,10 @@ class LieGroupParameter(torch.nn.Parameter):
             self.group = self.retr()
             self.zero_()
         return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> LieGroupParameter:
+        copied = type(self)(self.group.clone(), self.requires_grad)
+        with torch.no_grad():
+            copied.copy_(self)
+        memo[id(self)] = copied
+        return copied

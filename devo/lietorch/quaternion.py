@@ -42,6 +42,13 @@ def _table(entries: tuple[tuple[tuple[int, int, int], ...], ...], dtype: torch.d
 
 
 @lru_cache(maxsize=32)
+def _hat_table(dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False), torch.no_grad():
+        rows = [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]]
+        return torch.tensor(rows, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=32)
 def _conjugation(dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False), torch.no_grad():
         return torch.tensor([-1.0, -1.0, -1.0, 1.0], dtype=dtype, device=device)
@@ -70,6 +77,21 @@ def apply_matrix(matrix: Tensor, vector: Tensor) -> Tensor:
     rows = vector.flatten(lead, -2)
     out = precise_matmul(rows, matrix.reshape(*matrix.shape[:lead], *matrix.shape[-2:]).mT)
     return out if shared == 1 else out.reshape(*out.shape[:lead], *vector.shape[lead:-1], out.shape[-1])
+
+
+def cos_sin(angle: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine of angles in radians.
+
+    One complex operation, because `Tensor.cos`, `sin`, `sqrt` and `atan` start threads for as few as a hundred numbers
+    on CPUs with MKL, which costs milliseconds per call on a busy machine.
+    """
+    pair = torch.polar(torch.ones_like(angle), angle)
+    return pair.real, pair.imag
+
+
+def hat(a: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) with hat(a) b = a x b, of vectors `a` (..., 3)."""
+    return precise_matmul(a, _hat_table(a.dtype, a.device)).unflatten(-1, (3, 3))
 
 
 def quat_multiply(q: Tensor, r: Tensor) -> Tensor:

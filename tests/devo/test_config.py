@@ -30,7 +30,7 @@ def test_published_defaults() -> None:
 def test_clone_is_independent() -> None:
     copy = cfg.clone()
     copy.KEYFRAME_THRESH = 3
-    assert cfg.KEYFRAME_THRESH == DEFAULTS["KEYFRAME_THRESH"]
+    assert DEFAULTS["KEYFRAME_THRESH"] == cfg.KEYFRAME_THRESH
     assert copy.KEYFRAME_THRESH == 3.0 and isinstance(copy.KEYFRAME_THRESH, float)
     assert copy != cfg and pickle.loads(pickle.dumps(copy)) == copy
 

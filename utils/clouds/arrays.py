@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import tokenize
 import zipfile
 import zlib
 
@@ -17,7 +18,7 @@ from utils.clouds.table import read_file, reject
 
 _METADATA = "metadata_json"
 _DAMAGED = (ValueError, TypeError, SyntaxError, EOFError, OSError, KeyError, MemoryError, OverflowError,
-            NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+            NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
 """What NumPy and zipfile raise on damaged files."""
 
 
@@ -76,12 +77,7 @@ def read_npz(path: str | os.PathLike[str]) -> PointCloud:
     Raises:
         InputError: missing, malformed, pickled or truncated file, or arrays that do not fit together.
     """
-    try:
-        with zipfile.ZipFile(io.BytesIO(read_file(path))) as archive:
-            members = {name.removesuffix(".npy"): archive.read(name) for name in archive.namelist()}
-    except _DAMAGED as error:
-        reject(path, f"is no NPZ archive or a damaged one ({error})")
-    arrays = {name: _parse_array(path, content) for name, content in members.items()}
+    arrays = load_arrays(path)
     metadata = _parse_metadata(path, arrays.pop(_METADATA, np.array("{}")))
     if "points" not in arrays:
         reject(path, f"has no array named points, found {', '.join(sorted(arrays)) or 'nothing'}")
@@ -89,6 +85,20 @@ def read_npz(path: str | os.PathLike[str]) -> PointCloud:
         return PointCloud(arrays.pop("points"), arrays.pop("colors", None), arrays, metadata)
     except InputError as error:
         reject(path, str(error))
+
+
+def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """The arrays of an `.npz` file by name, without pickle.
+
+    Raises:
+        InputError: missing, malformed, pickled or truncated file.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_file(path))) as archive:
+            members = {name.removesuffix(".npy"): archive.read(name) for name in archive.namelist()}
+    except _DAMAGED as error:
+        reject(path, f"is no NPZ archive or a damaged one ({error})")
+    return {name: _parse_array(path, content) for name, content in members.items()}
 
 
 def _parse_array(path: str | os.PathLike[str], content: bytes) -> np.ndarray:

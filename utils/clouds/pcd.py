@@ -143,7 +143,7 @@ def _row_type(path: str | os.PathLike[str], header: dict[str, list[str]]) -> np.
                      f"{len(header['TYPE'])} and {len(counts)} entries")
     types: list[tuple[str, str]] = []
     for name, size, kind, count in zip(fields, header["SIZE"], header["TYPE"], counts):
-        if size not in map(str, _SIZES.get(kind, ())) or not count.isdigit() or not 0 < int(count) <= 4096:
+        if size not in map(str, _SIZES.get(kind, ())) or not _is_number(count) or not 0 < int(count) <= 4096:
             reject(path, f"field {name} has type {kind}, size {size} and count {count}, which PCD does not know")
         code = f"<{kind.lower()}{size}"
         if name == "_":
@@ -158,6 +158,10 @@ def _row_type(path: str | os.PathLike[str], header: dict[str, list[str]]) -> np.
 
 def _number(path: str | os.PathLike[str], header: dict[str, list[str]], entry: str) -> int:
     words = header[entry]
-    if len(words) != 1 or not words[0].isascii() or not words[0].isdigit() or len(words[0]) > 15:
+    if len(words) != 1 or not _is_number(words[0]):
         reject(path, f"{entry} must be one whole number, found {' '.join(words)[:80]!r}")
     return int(words[0])
+
+
+def _is_number(word: str) -> bool:
+    return word.isascii() and word.isdigit() and len(word) < 16  # str.isdigit alone accepts superscripts

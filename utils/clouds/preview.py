@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 _BACKGROUND, _PANEL, _GRID, _TEXT, _FAINT = "#0e1116", "#151a21", "#2a313c", "#e6e9ee", "#97a1b0"
 _PATH, _START, _END = "#ff6f61", "#7ee787", "#ffffff"
+ARBITRARY = "arbitrary units"
+"""What one unit of a monocular reconstruction is."""
+
 _START_MARKER: dict[str, Any] = {"marker": "o", "color": _START, "markersize": 11, "markerfacecolor": "none",
                                  "markeredgewidth": 2, "linestyle": ""}
 _END_MARKER: dict[str, Any] = {"marker": "s", "color": _END, "markersize": 6, "markeredgecolor": _BACKGROUND,
@@ -37,6 +40,7 @@ def save_preview(
     *,
     title: str = "",
     color_by: str = "depth",
+    unit: str = ARBITRARY,
 ) -> None:
     """Draw the cloud and the trajectory into a PNG: perspective, top and side view with equal axes.
 
@@ -51,6 +55,7 @@ def save_preview(
             Poses that are not finite are left out.
         title: headline.
         color_by: `depth` (world z) or `height` (minus world y).
+        unit: what one unit of length is, for the labels; say `m` only of aligned or metric clouds.
 
     Raises:
         InputError: poses of another shape, or an unknown colouring.
@@ -65,10 +70,10 @@ def save_preview(
     figure = Figure(figsize=(16, 9), dpi=120, facecolor=_BACKGROUND)
     FigureCanvasAgg(figure)
     _draw_perspective(figure, scene)
-    _draw_plane(figure, (0.645, 0.555, 0.325, 0.335), scene, (0, 2), "top view")
-    _draw_plane(figure, (0.645, 0.105, 0.325, 0.335), scene, (2, 1), "side view")
-    _draw_color_bar(figure, scene, _COLORINGS[color_by][2])
-    _write_texts(figure, scene, title)
+    _draw_plane(figure, (0.645, 0.555, 0.325, 0.335), scene, (0, 2), "top view", unit)
+    _draw_plane(figure, (0.645, 0.105, 0.325, 0.335), scene, (2, 1), "side view", unit)
+    _draw_color_bar(figure, scene, f"{_COLORINGS[color_by][2]} ({unit})")
+    _write_texts(figure, scene, title, unit)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", facecolor=_BACKGROUND)
 
@@ -154,7 +159,7 @@ def _rotations(quat_xyzw: np.ndarray) -> np.ndarray:
 
 
 def _view() -> np.ndarray:
-    """Rows right, up and forward of the virtual camera in world axes; up is minus y, the way the first camera sees it."""
+    """Rows right, up and forward of the virtual camera in world axes; the world's y points down, as in an image."""
     forward = np.asarray(_LOOK) / np.linalg.norm(_LOOK)
     right = np.cross((0.0, 1.0, 0.0), forward)
     right /= np.linalg.norm(right)
@@ -213,12 +218,13 @@ def _draw_triad(figure: Figure) -> None:
     axes.set_ylim(-1.4, 1.4)
     for name, tip in zip("xyz", _view()[:2].T):
         axes.annotate("", tip, (0, 0), arrowprops={"arrowstyle": "-|>", "color": _FAINT, "shrinkA": 0, "shrinkB": 0})
-        axes.text(*(tip * (1 + 0.25 / max(np.linalg.norm(tip), 0.3))), name, color=_FAINT, ha="center", va="center",
-                  fontsize=10)
+        x, y = tip * (1 + 0.25 / max(float(np.linalg.norm(tip)), 0.3))
+        axes.text(x, y, name, color=_FAINT, ha="center", va="center", fontsize=10)
 
 
 def _draw_plane(
-    figure: Figure, place: tuple[float, float, float, float], scene: _Scene, shown: tuple[int, int], name: str
+    figure: Figure, place: tuple[float, float, float, float], scene: _Scene, shown: tuple[int, int], name: str,
+    unit: str,
 ) -> None:
     """One orthographic view; the axis y, which points down, is drawn downwards."""
     axes = figure.add_axes(place)
@@ -228,8 +234,8 @@ def _draw_plane(
     axes.tick_params(colors=_FAINT, labelsize=9, length=0)
     for spine in axes.spines.values():
         spine.set_color(_GRID)
-    axes.set_xlabel(f"{'xyz'[shown[0]]} (arbitrary units)", color=_FAINT, fontsize=10)
-    axes.set_ylabel(f"{'xyz'[shown[1]]} (arbitrary units)", color=_FAINT, fontsize=10)
+    axes.set_xlabel(f"{'xyz'[shown[0]]} ({unit})", color=_FAINT, fontsize=10)
+    axes.set_ylabel(f"{'xyz'[shown[1]]} ({unit})", color=_FAINT, fontsize=10)
     axes.set_title(name, color=_TEXT, fontsize=12, loc="left")
     axes.scatter(scene.points[:, shown[0]], scene.points[:, shown[1]], s=scene.point_size * 0.55, c=scene.values,
                  cmap=_color_map(), vmin=scene.value_limits[0], vmax=scene.value_limits[1], linewidths=0, alpha=0.75)
@@ -279,14 +285,15 @@ def _draw_color_bar(figure: Figure, scene: _Scene, label: str) -> None:
     bar = figure.colorbar(mapping, cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)  # type: ignore[operator]
     axes.tick_params(colors=_FAINT, labelsize=9, length=0)
-    axes.set_title(f"{label} (arbitrary units)", color=_FAINT, fontsize=9, loc="left", pad=5)
+    axes.set_title(label, color=_FAINT, fontsize=9, loc="left", pad=5)
 
 
-def _write_texts(figure: Figure, scene: _Scene, title: str) -> None:
+def _write_texts(figure: Figure, scene: _Scene, title: str, unit: str) -> None:
     steps = np.linalg.norm(np.diff(scene.poses[:, :3], axis=0), axis=1)
     summary = (f"{_count(scene.total, 'point')}    {_count(len(scene.poses), 'pose')}    "
-               f"path length {steps.sum():.3g} units")
-    notes = ["monocular: arbitrary scale", "world frame = first camera (x right, y down, z forward)"]
+               f"path length {steps.sum():.3g} {'units' if unit == ARBITRARY else unit}")
+    notes = ["monocular: arbitrary scale"] if unit == ARBITRARY else []
+    notes += ["world frame = first camera (x right, y down, z forward)"]
     if scene.outside:
         notes.append(f"{_count(scene.outside, 'point')} outside the view")
     if scene.nonfinite:

@@ -94,7 +94,7 @@ class Hdf5EventReader(RowReader):
 
     def _find_datasets(self) -> dict[str, Any]:
         group: Any = self._file
-        if isinstance(self._file.get("events"), h5py.Group) and "x" in self._file["events"]:
+        if isinstance(self._file.get("events"), h5py.Group) and "x" not in self._file:
             group = self._file["events"]
         missing = [name for name in "xytp" if not isinstance(group.get(name), h5py.Dataset)]
         if missing:

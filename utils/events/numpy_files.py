@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -19,12 +21,12 @@ from utils.events.validate import Column, Order, TimeUnit, check_guessed_unit, g
 
 _ROWS_PER_BLOCK = 1 << 18
 _ALIASES: dict[str, tuple[str, ...]] = {
-    "x": ("x", "xs"), "y": ("y", "ys"), "p": ("p", "ps", "pol", "polarity", "polarities"),
-    "t": ("t", "ts", "t_us", "timestamp", "timestamps", "time"),
+    "x": ("x", "xs"), "y": ("y", "ys"), "t": ("t", "ts", "t_us", "timestamp", "timestamps", "time"),
+    "p": ("p", "ps", "pol", "polarity", "polarities"),
 }
 # Everything that NumPy and zipfile raise on damaged input; none of it may reach the user as a traceback.
-_DAMAGE = (OSError, EOFError, ValueError, SyntaxError, TypeError, KeyError, NotImplementedError, OverflowError,
-           MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_DAMAGE = (OSError, EOFError, ValueError, SyntaxError, TypeError, AttributeError, LookupError, ArithmeticError,
+           MemoryError, RuntimeError, tokenize.TokenError, struct.error, zipfile.BadZipFile, zlib.error)
 
 
 def find_columns(names: list[str], path: Path) -> dict[str, str]:
@@ -176,13 +178,13 @@ class NpyEventReader(RowReader):
         elif self._array.dtype.names is None and self._array.ndim == 2 and self._array.shape[1] == 4:
             self._fields = {}
         else:
-            raise InputError(f"{path}: array of dtype {self._array.dtype} and shape {self._array.shape}, expected records "
-                             "with the fields x, y, t, p or a table (N, 4) with the columns t x y p")
+            raise InputError(f"{path}: array of dtype {self._array.dtype} and shape {self._array.shape}, expected "
+                             "records with the fields x, y, t, p or a table (N, 4) with the columns t x y p")
         self.rows = len(self._array)
         self._unit = time_unit or guess_time_unit(self._column("t", 0, min(self.rows, _ROWS_PER_BLOCK)))
         if time_unit is None and self.rows:
-            t_us = to_microseconds(self._column("t", 0, min(self.rows, 4096)), self._unit, lambda i: f"{path}: event {i}")
-            check_guessed_unit(t_us, self._unit, str(path))
+            head = self._column("t", 0, min(self.rows, 4096))
+            check_guessed_unit(to_microseconds(head, self._unit, lambda i: f"{path}: event {i}"), self._unit, str(path))
 
     def close(self) -> None:
         """Release the memory map."""

@@ -86,7 +86,7 @@ class EventReader(abc.ABC):
             InputError: `stop_us < start_us`, or the file turns out to be damaged.
         """
         if not start_us <= stop_us:
-            raise InputError(f"{self.path}: cannot read from {start_us} us to {stop_us} us, the end is before the start")
+            raise InputError(f"{self.path}: cannot read from {start_us} us to {stop_us} us, the end comes first")
         return Events.concatenate(list(self.chunks(1 << 62, start_us=start_us, stop_us=stop_us)))
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devo.errors import InputError
-from utils.events.reader import EventReader
+from utils.events.reader import EventReader, RowReader
 from utils.events.types import Events
 
 
@@ -46,17 +46,19 @@ class WindowRule(abc.ABC):
     """
 
     @abc.abstractmethod
-    def over(self, reader: EventReader, start_us: float | None = None,
-             stop_us: float | None = None) -> Iterator[EventWindow]:
+    def over(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+             every: int = 1) -> Iterator[EventWindow]:
         """Yield the windows of `reader` in time order; windows without events are yielded too.
 
         Args:
             reader: the recording.
             start_us, stop_us: use only windows inside `[start_us, stop_us)`, on the clock of the recording.
+            every: yield only the windows 0, every, 2*every, ...; their length does not change.
         """
 
     @abc.abstractmethod
-    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None) -> int | None:
+    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+              every: int = 1) -> int | None:
         """Return how many windows `over` yields, None if only reading all events could tell."""
 
     @abc.abstractmethod
@@ -91,23 +93,24 @@ class TimeWindows(WindowRule):
         """Step from window to window in microseconds."""
         return self.window_us if self.stride_us is None else self.stride_us
 
-    def over(self, reader: EventReader, start_us: float | None = None,
-             stop_us: float | None = None) -> Iterator[EventWindow]:
+    def over(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+             every: int = 1) -> Iterator[EventWindow]:
         """Yield `[s, s + window_us)` for `s` = first event (or `start_us`) plus multiples of the stride."""
         first = self._first(reader, start_us)
-        for number in range(self.count(reader, start_us, stop_us)):
-            start = first + number * self.step_us
+        for number in range(self.count(reader, start_us, stop_us, every)):
+            start = first + number * every * self.step_us
             stop = start + self.window_us
             yield EventWindow(reader.read(start, stop), start, stop)
 
-    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None) -> int:
+    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+              every: int = 1) -> int:
         """Return the number of windows, from the time range of the recording alone."""
         first, end = self._first(reader, start_us), reader.time_range_us()[1] + 1
         covered = max(1, math.ceil(self.window_us * self.least_last_fraction))
         last = end - covered  # the latest start of a window that is covered enough
         if stop_us is not None:
             last = min(last, math.floor(stop_us) - self.window_us)
-        return 0 if last < first else (last - first) // self.step_us + 1
+        return 0 if last < first else (last - first) // (self.step_us * every) + 1
 
     def describe(self) -> dict[str, object]:
         """Return the rule as plain values."""
@@ -141,18 +144,18 @@ class CountWindows(WindowRule):
 
     def __post_init__(self) -> None:
         if self.window_events < 1 or self.step_events < 1:
-            raise InputError(f"window of {self.window_events} events every {self.step_events} events, expected at least 1")
+            raise InputError(f"window of {self.window_events} events every {self.step_events}, expected at least 1")
 
     @property
     def step_events(self) -> int:
         """Step from window to window in events."""
         return self.window_events if self.stride_events is None else self.stride_events
 
-    def over(self, reader: EventReader, start_us: float | None = None,
-             stop_us: float | None = None) -> Iterator[EventWindow]:
+    def over(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+             every: int = 1) -> Iterator[EventWindow]:
         """Yield windows whose borders are the stamps of their first and last event."""
         pending: list[Events] = []
-        held = skip = 0
+        held = skip = made = 0
         for chunk in reader.chunks(start_us=start_us, stop_us=stop_us):
             pending.append(chunk)
             held += len(chunk)
@@ -160,20 +163,29 @@ class CountWindows(WindowRule):
                 continue
             buffer = Events.concatenate(pending)
             while len(buffer) - skip >= self.window_events:
-                yield _count_window(buffer[skip:skip + self.window_events])
+                if made % every == 0:
+                    yield _count_window(buffer[skip:skip + self.window_events])
+                made += 1
                 skip += self.step_events
             drop = min(skip, len(buffer))
             pending, held, skip = [buffer[drop:]], len(buffer) - drop, skip - drop
         rest = Events.concatenate(pending)[skip:]
-        # With overlapping windows the rest was seen already, except for what lies behind the last whole window.
-        unseen = len(rest) - max(0, self.window_events - self.step_events)
-        first_window = held == len(rest) and unseen < len(rest)
-        if len(rest) >= max(1, self.window_events * self.least_last_fraction) and (unseen > 0 or first_window):
+        if made % every == 0 and self._keeps_rest(len(rest), made):
             yield _count_window(rest)
 
-    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None) -> int | None:
-        """Return None: the number of events in a time range is not known before reading."""
-        return None
+    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+              every: int = 1) -> int | None:
+        """Return the number of windows where the file says how many events it holds, else None."""
+        if start_us is not None or stop_us is not None or not isinstance(reader, RowReader):
+            return None
+        full = max(0, (len(reader) - self.window_events) // self.step_events + 1)
+        rest = len(reader) - full * self.step_events
+        return -(-(full + self._keeps_rest(rest, full)) // every)
+
+    def _keeps_rest(self, rest: int, full_windows: int) -> bool:
+        """Whether the events behind the last full window make a window: enough of them, and some not seen before."""
+        already_seen = self.window_events - self.step_events if full_windows else 0
+        return rest > already_seen and rest >= max(1.0, self.window_events * self.least_last_fraction)
 
     def describe(self) -> dict[str, object]:
         """Return the rule as plain values."""
@@ -192,16 +204,14 @@ class StampWindows(WindowRule):
         stamps_us: (N,) increasing, microseconds on the clock of the events.
         window_us: length of `[s_i, s_i + window_us)`; None means up to the next stamp, `[s_i, s_{i+1})`, which
             makes N - 1 windows.
-        stride: use every stride-th stamp; the length of the windows does not change.
         least_last_fraction: see `WindowRule`.
 
     Raises:
-        InputError: stamps that do not increase, too few of them, or a length or stride that is not positive.
+        InputError: stamps that do not increase, too few of them, or a length that is not positive.
     """
 
     stamps_us: npt.NDArray[np.float64]
     window_us: float | None = None
-    stride: int = 1
     least_last_fraction: float = 0.0
 
     def __post_init__(self) -> None:
@@ -214,36 +224,38 @@ class StampWindows(WindowRule):
             index = int(np.argmax(~np.isfinite(stamps))) if not np.all(np.isfinite(stamps)) else int(
                 np.argmax(np.diff(stamps) <= 0)) + 1
             raise InputError(f"image stamp {index} is {stamps[index]} us and not later than the one before it")
-        if self.stride < 1 or (self.window_us is not None and not self.window_us > 0):
-            raise InputError(f"stride {self.stride} and window {self.window_us} us must be positive")
+        if self.window_us is not None and not self.window_us > 0:
+            raise InputError(f"window is {self.window_us} us, expected a positive length")
 
-    def over(self, reader: EventReader, start_us: float | None = None,
-             stop_us: float | None = None) -> Iterator[EventWindow]:
+    def over(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+             every: int = 1) -> Iterator[EventWindow]:
         """Yield the windows that overlap the recording."""
-        for start, stop in zip(*self._borders(reader, start_us, stop_us)):
+        for start, stop in zip(*self._borders(reader, start_us, stop_us, every)):
             yield EventWindow(reader.read(start, stop), start, stop)
 
-    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None) -> int:
+    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+              every: int = 1) -> int:
         """Return the number of windows, from the stamps and the time range of the recording."""
-        return len(self._borders(reader, start_us, stop_us)[0])
+        return len(self._borders(reader, start_us, stop_us, every)[0])
 
     def describe(self) -> dict[str, object]:
         """Return the rule as plain values."""
         length = "to the next stamp" if self.window_us is None else float(self.window_us)
-        return {"rule": "stamps", "stamps": len(self.stamps_us), "window_us": length, "stride": self.stride}
+        return {"rule": "stamps", "stamps": len(self.stamps_us), "window_us": length}
 
-    def _borders(self, reader: EventReader, start_us: float | None,
-                 stop_us: float | None) -> tuple[list[float], list[float]]:
+    def _borders(self, reader: EventReader, start_us: float | None, stop_us: float | None,
+                 every: int) -> tuple[list[float], list[float]]:
         starts = self.stamps_us[:-1] if self.window_us is None else self.stamps_us
         stops = self.stamps_us[1:] if self.window_us is None else self.stamps_us + self.window_us
-        starts, stops = starts[::self.stride], stops[::self.stride]
+        wanted = np.ones(len(starts), bool)
+        if start_us is not None:
+            wanted &= starts >= start_us
+        if stop_us is not None:
+            wanted &= stops <= stop_us
+        starts, stops = starts[wanted][::every], stops[wanted][::every]
         first_us, last_us = reader.time_range_us()
         covered = np.minimum(stops, last_us + 1) - starts
         keep = (stops > first_us) & (covered > 0) & (covered >= self.least_last_fraction * (stops - starts))
-        if start_us is not None:
-            keep &= starts >= start_us
-        if stop_us is not None:
-            keep &= stops <= stop_us
         return starts[keep].tolist(), stops[keep].tolist()
 
 

@@ -16,8 +16,8 @@ from utils.events.validate import Order, TimeUnit, check_guessed_unit
 
 _BLOCK_BYTES = 1 << 19  # half a megabyte: the work arrays of one block stay in the processor's cache
 _LONGEST_LINE = 1 << 16
-_COLUMN_NAMES = {"t": "t", "ts": "t", "time": "t", "timestamp": "t", "timestamps": "t", "stamp": "t", "x": "x", "y": "y",
-                 "p": "p", "pol": "p", "polarity": "p"}
+_COLUMN_NAMES = {"t": "t", "ts": "t", "time": "t", "timestamp": "t", "timestamps": "t", "stamp": "t",
+                 "x": "x", "y": "y", "p": "p", "pol": "p", "polarity": "p"}
 _UNIT_NAMES: tuple[tuple[str, TimeUnit], ...] = (
     (r"\b(ns|nsec|nanosec\w*|t_ns|ts_ns)\b", "ns"),
     (r"\b(us|usec|µs|microsec\w*|t_us|ts_us)\b", "us"),
@@ -138,18 +138,17 @@ class TextEventReader(SequentialReader):
             tokens = line.replace(b",", b" ").split()
             if not tokens:
                 continue
-            if tokens[0].startswith(b"#") or re.fullmatch(rb"[A-Za-z_]\w*(\[\w*\])?", tokens[0]):
-                unit = self._unit_of_header(line) or unit
-                if not tokens[0].startswith(b"#") and tokens[0].lower() in (b"nan", b"inf", b"infinity"):
-                    return _Header(offset, unit, size, tokens[0])
+            named, columns = self._columns_of_header(line)
+            if columns or tokens[0].startswith(b"#"):
+                unit = named or unit
                 continue
             if len(tokens) == 2 and size is None and all(token.isdigit() for token in tokens):
                 size = (int(tokens[0]), int(tokens[1]))
                 continue
             return _Header(offset, unit, size, tokens[0])
 
-    def _unit_of_header(self, line: bytes) -> TimeUnit | None:
-        """Return the unit a header line names; only lines that name all four columns count.
+    def _columns_of_header(self, line: bytes) -> tuple[TimeUnit | None, bool]:
+        """Return the unit that a header line names and whether the line names all four columns at all.
 
         Raises:
             InputError: the columns stand in another order than t x y p.
@@ -158,11 +157,11 @@ class TextEventReader(SequentialReader):
         tokens = re.sub(r"_(ns|us|ms|s)\b", "", words)
         columns = [_COLUMN_NAMES[word] for word in re.findall(r"[a-z]+", tokens) if word in _COLUMN_NAMES]
         if sorted(columns) != sorted("txyp"):
-            return None
+            return None, False
         if columns != list("txyp"):
             raise InputError(f"{self.path}: the header names the columns {' '.join(columns)}, expected t x y p; "
                              "reorder the columns first")
-        return next((unit for pattern, unit in _UNIT_NAMES if re.search(pattern, words)), None)
+        return next((unit for pattern, unit in _UNIT_NAMES if re.search(pattern, words)), None), True
 
 
 def format_events(events: Events) -> str:

@@ -153,7 +153,7 @@ def _parse_polarity(text: npt.NDArray[np.uint8], end_y: Ints, end_p: Ints, minus
 def _parse_stamps(text: npt.NDArray[np.uint8], words: Words, starts: Ints, ends: Ints, decimal: bool,
                   unit: TimeUnit) -> Ints | None:
     """Parse stamps with or without decimals into microseconds, rounding half up."""
-    whole_ends = np.flatnonzero(text == _DOT) if decimal else ends
+    whole_ends = _dot_positions(text, starts, ends) if decimal else ends
     whole = _parse_whole(words, whole_ends, whole_ends - starts)
     if whole is None or (decimal and np.any(whole_ends >= ends)):
         return None
@@ -176,6 +176,14 @@ def _parse_stamps(text: npt.NDArray[np.uint8], words: Words, starts: Ints, ends:
         value += divisor // 2
         whole += value // divisor
     return whole
+
+
+def _dot_positions(text: npt.NDArray[np.uint8], starts: Ints, ends: Ints) -> Ints:
+    """Find the dots, one per stamp; quick when all stamps have as many decimals as the first one."""
+    first_dot = int(np.argmax(text[starts[0]:] == _DOT)) + int(starts[0])
+    same_width = ends - (int(ends[0]) - first_dot)
+    # Where every stamp has a dot at its place, these are all dots: their number equals the number of lines.
+    return same_width if np.all(text[same_width] == _DOT) else np.flatnonzero(text == _DOT)
 
 
 def _parse_lines(block: bytes, unit: TimeUnit) -> RawColumns:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,7 +49,8 @@ class Events:
 
     def between(self, start_us: float, stop_us: float) -> Events:
         """Return the events with `start_us <= t_us < stop_us` (views, binary search)."""
-        first, last = np.searchsorted(self.t_us, [np.ceil(start_us), np.ceil(stop_us)], side="left")
+        borders = np.array([_whole(start_us), _whole(stop_us)], np.int64)  # floats would make numpy copy all stamps
+        first, last = np.searchsorted(self.t_us, borders, side="left")
         return self[int(first):int(last)]
 
     @classmethod
@@ -65,3 +67,8 @@ class Events:
         if not filled:
             return cls.empty()
         return cls(*(np.concatenate([getattr(part, name) for part in filled]) for name in ("x", "y", "t_us", "p")))
+
+
+def _whole(border_us: float) -> int:
+    """Return the first whole microsecond at or after a border, infinite borders included."""
+    return math.ceil(min(max(border_us, -(2.0**62)), 2.0**62))

@@ -90,8 +90,8 @@ def check_guessed_unit(t_us: npt.NDArray[np.int64], unit: TimeUnit, source: str)
         return
     seconds = max(int(t_us[-1]) - int(t_us[0]), 1) * 1e-6
     if len(t_us) / seconds < _LEAST_EVENTS_PER_SECOND:
-        raise InputError(f"{source}: read as {unit!r} the first {len(t_us)} events would span {seconds:.0f} s, which no "
-                         "event camera is that quiet for; pass the unit of the stamps, for example time_unit=\"us\"")
+        raise InputError(f"{source}: read as {unit!r} the first {len(t_us)} events would span {seconds:.0f} s, but no "
+                         "event camera is that quiet; pass the unit of the stamps, for example time_unit=\"us\"")
 
 
 def to_microseconds(stamps: Column, unit: TimeUnit, where: Locator) -> npt.NDArray[np.int64]:

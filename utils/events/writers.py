@@ -1,4 +1,4 @@
-"""Write events: HDF5 in the DSEC layout (also piece by piece), NPZ and text. Every file appears complete or not at all."""
+"""Write events as HDF5 (DSEC layout, also piece by piece), NPZ and text; files appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from devo.errors import InputError
 from utils.atomic import atomic_path
+from utils.events.hdf5_output import create_hdf5
 from utils.events.text import format_events
 from utils.events.types import Events
 from utils.events.validate import make_events
@@ -79,11 +80,9 @@ class EventH5Writer:
         self._indexed_ms = 0
 
     def __enter__(self) -> EventH5Writer:
-        temporary = self._stack.enter_context(atomic_path(self.path))
+        self._output = self._stack.enter_context(create_hdf5(self.path))
+        self._file = self._output.file
         try:
-            # The newest metadata layout that HDF5 1.10 (2016) reads; unlike older ones it carries checksums.
-            self._file = h5py.File(temporary, "w", libver=("v110", "v110"))
-            self._stack.callback(self._close)
             group = self._file.create_group("events")
             for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.uint32), ("p", np.uint8)):
                 self._create(group, name, dtype)
@@ -99,12 +98,6 @@ class EventH5Writer:
                 self._finish()
             else:
                 self._stack.__exit__(kind, error, trace)
-
-    def _close(self) -> None:
-        try:
-            self._file.close()
-        except RuntimeError as error:  # how h5py reports a disk that fills up while flushing
-            raise OSError(str(error)) from error
 
     def write(self, events: Events) -> None:
         """Append events that start at or after the last one written."""
@@ -122,18 +115,20 @@ class EventH5Writer:
             raise InputError(f"cannot append to {self.path}: events must be sorted and start at or after "
                              f"{max(self._last_us, self._offset_us)} us, found {first_us} us")
         if last_us - self._offset_us > _LONGEST_SPAN_US:
-            raise InputError(f"cannot write {self.path}: the last event is {(last_us - self._offset_us) / 1e6:.0f} s after "
-                             "t_offset_us; pass t_offset_us=None to count from the first event")
+            raise InputError(f"cannot write {self.path}: the last event is {(last_us - self._offset_us) / 1e6:.0f} s "
+                             "after t_offset_us; pass t_offset_us=None to count from the first event")
         t_us = events.t_us - self._offset_us
         if int(t_us[-1]) >= _UINT32_END and self._file["events/t"].dtype == np.uint32:
             self._widen_time()
-        for name, column in (("x", events.x), ("y", events.y), ("t", t_us), ("p", events.p)):
+        columns: dict[str, npt.NDArray[Any]] = {"x": events.x, "y": events.y, "t": t_us, "p": events.p}
+        for name, column in columns.items():
             dataset = self._file["events"][name]
             dataset.resize(self._rows + len(events), axis=0)
             dataset[self._rows:] = column
         self._extend_index(t_us)
         self._rows += len(events)
         self._last_us = last_us
+        self._output.check()
 
     def _create(self, group: h5py.Group, name: str, dtype: npt.DTypeLike) -> Any:
         return group.create_dataset(name, (0,), maxshape=(None,), chunks=(_CHUNK_EVENTS,), dtype=dtype, fletcher32=True,
@@ -160,9 +155,18 @@ class EventH5Writer:
         index = np.concatenate(self._index)
         self._file.create_dataset("ms_to_idx", data=index, chunks=(min(len(index), _CHUNK_EVENTS),), fletcher32=True,
                                   **self._filter)
-        self._file.create_dataset("t_offset", data=np.int64(self._offset_us or 0))
+        self._write_offset(self._offset_us or 0)
         if self._sensor_size is not None:
             self._file.attrs["width"], self._file.attrs["height"] = self._sensor_size
+
+
+    def _write_offset(self, offset_us: int) -> None:
+        """Store the scalar inside the metadata, whose checksum then covers it too."""
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_layout(h5py.h5d.COMPACT)
+        scalar = h5py.h5s.create(h5py.h5s.SCALAR)
+        h5py.h5d.create(self._file.id, b"t_offset", h5py.h5t.STD_I64LE, scalar, dcpl=layout)
+        self._file["t_offset"][()] = np.int64(offset_us)
 
 
 def _filter_options(compression: Compression) -> dict[str, Any]:

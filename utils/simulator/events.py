@@ -132,3 +132,65 @@ def threshold_maps(shape: tuple[int, ...], settings: EventSettings, generator: t
     positive = settings.threshold * ratio * noise[0].exp()
     negative = settings.threshold / ratio * noise[1].exp()
     return positive.clamp(min=0.01).to(device), negative.clamp(min=0.01).to(device)
+
+
+def resting_pixels(shape: tuple[int, int], settings: EventSettings, generator: torch.Generator,
+                   device: torch.device | str) -> PixelArray:
+    """Pixels in the middle of their life: the distance to the next event is random."""
+    positive, negative = threshold_maps(shape, settings, generator, device)
+    leak = settings.leak_hz * 1e-6 * positive if settings.leak_hz > 0 else 0.0
+    array = PixelArray(positive, negative, settings.refractory_us, leak)
+    phase = torch.rand(shape, generator=generator).to(device)
+    array.residual = phase * (positive + negative) * 0.999 - negative * 0.999
+    return array
+
+
+@dataclasses.dataclass(frozen=True)
+class TimedEvents:
+    """Single events: flat pixel index `(N,)` int64, time `(N,)` float64 microseconds, sign `(N,)` float32 -1 or +1."""
+
+    pixel: torch.Tensor
+    t_us: torch.Tensor
+    sign: torch.Tensor
+
+
+def expand(crossings: Crossings, start_us: float, duration_us: float) -> TimedEvents:
+    """Write out the arithmetic series of one step as single events, pixel by pixel, not sorted by time."""
+    count = crossings.count.reshape(-1)
+    firing = torch.nonzero(count).flatten()
+    repeats = count[firing].long()
+    pixel = firing.repeat_interleave(repeats)
+    number = torch.arange(len(pixel), device=count.device) - (repeats.cumsum(0) - repeats).repeat_interleave(repeats)
+    fraction = crossings.first.reshape(-1)[pixel] + number * crossings.spacing.reshape(-1)[pixel]
+    t_us = start_us + fraction.clamp(0.0, 1.0).double() * duration_us
+    return TimedEvents(pixel, t_us, crossings.sign.reshape(-1)[pixel])
+
+
+class NoiseSource:
+    """Random events that have nothing to do with the scene: shot noise everywhere, and hot pixels.
+
+    Args:
+        settings: rates.
+        area: number of pixels.
+        generator: CPU generator; chooses the hot pixels now and the events later.
+    """
+
+    def __init__(self, settings: EventSettings, area: int, generator: torch.Generator) -> None:
+        self._area, self._generator = area, generator
+        self._shots_per_us = settings.shot_hz * 1e-6 * area
+        hot = int(torch.poisson(torch.tensor(settings.hot_fraction * area), generator=generator))
+        self._hot = torch.randint(area, (hot,), generator=generator)
+        self._hot_per_us = settings.hot_hz * 2e-6 * torch.rand(hot, generator=generator)
+        self._hot_sign = torch.randint(2, (hot,), generator=generator) * 2.0 - 1.0
+
+    def draw(self, start_us: float, duration_us: float) -> TimedEvents:
+        """Noise events of an interval, not sorted by time."""
+        shots = int(torch.poisson(torch.tensor(self._shots_per_us * duration_us), generator=self._generator))
+        pixel = torch.randint(self._area, (shots,), generator=self._generator)
+        sign = torch.randint(2, (shots,), generator=self._generator) * 2.0 - 1.0
+        if len(self._hot):
+            counts = torch.poisson(self._hot_per_us * duration_us, generator=self._generator).long()
+            pixel = torch.cat([pixel, self._hot.repeat_interleave(counts)])
+            sign = torch.cat([sign, self._hot_sign.repeat_interleave(counts)])
+        t_us = start_us + torch.rand(len(pixel), generator=self._generator, dtype=torch.float64) * duration_us
+        return TimedEvents(pixel, t_us, sign)

@@ -21,9 +21,11 @@ class PlaneList:
     sharpness: tuple[float, float] = (0.28, 1.0)
     rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]] = dataclasses.field(
         default_factory=list)
+    names: list[str] = dataclasses.field(default_factory=list)
 
     def add(self, origin: np.ndarray, normal: np.ndarray, half_u: float = UNBOUNDED, half_v: float = UNBOUNDED,
-            seen_from: float | None = None, spin: float | None = None) -> None:
+            seen_from: float | None = None, spin: float | None = None, whole_tile: bool = False,
+            name: str = "surface") -> None:
         """Add a piece with a random texture crop, so that a texel covers a random number of pixels at a distance.
 
         Args:
@@ -33,6 +35,8 @@ class PlaneList:
             half_v: half height, scene units.
             seen_from: distance at which the texture has its nominal size; by default the distance of `origin`.
             spin: rotation of the piece in its plane in radians; random by default.
+            whole_tile: let the texture tile span the width of the piece exactly, instead of a random crop.
+            name: what the piece is.
         """
         normal = np.asarray(normal, float) / np.linalg.norm(normal)
         helper = np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
@@ -41,12 +45,15 @@ class PlaneList:
         down = np.cross(normal, across)
         angle = self.rng.uniform(0, 2 * np.pi) if spin is None else spin
         axis_u = np.cos(angle) * across + np.sin(angle) * down
-        axis_v = np.cross(normal, axis_u)
+        axis_v = np.cross(axis_u, normal)  # to a viewer in front, u points right and v down, as in an image
         distance = float(np.linalg.norm(origin)) if seen_from is None else seen_from
         pixels_per_texel = float(np.exp(self.rng.uniform(*np.log(self.sharpness))))
         scale = self.focal / (self.tile * pixels_per_texel * max(distance, 0.05))
-        self.rows.append((np.asarray(origin, float), axis_u, axis_v, np.array([half_u, half_v]), scale,
-                          self.rng.uniform(0, 2, 2)))
+        offset = self.rng.uniform(0, 2, 2)
+        if whole_tile:
+            scale, offset = 0.5 / half_u, np.array([0.5, 0.5])
+        self.rows.append((np.asarray(origin, float), axis_u, axis_v, np.array([half_u, half_v]), scale, offset))
+        self.names.append(name)
 
     def planes(self) -> Planes:
         """The collected pieces as one scene of float32 tensors on the CPU."""

@@ -99,10 +99,11 @@ class Renderer:
         planes: one scene (leading dimension 1).
         atlas: textures of its P pieces as built by `textures.build_atlas`.
         rays: the camera.
+        empty: log intensity where no surface is hit.
     """
 
-    def __init__(self, planes: Planes, atlas: torch.Tensor, rays: Rays) -> None:
-        self.planes, self.atlas, self.rays = planes, atlas, rays
+    def __init__(self, planes: Planes, atlas: torch.Tensor, rays: Rays, empty: float = 0.0) -> None:
+        self.planes, self.atlas, self.rays, self.empty = planes, atlas, rays, empty
         count = planes.origin.shape[1]
         self.tile = atlas.shape[-2] // count - 2 if atlas.numel() else 4
         self.levels = mip_levels(self.tile)
@@ -114,7 +115,7 @@ class Renderer:
     def render(self, world_T_cam: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Log intensity and inverse z-depth `(M, H, W)` float32 seen from `(M, 7)` camera-to-world poses.
 
-        Pixels that no surface covers have inverse depth 0 and log intensity 0.
+        Pixels that no surface covers have inverse depth 0 and log intensity `empty`.
         """
         forms = _plane_forms(self.planes, world_T_cam, self.rays.focal, self.tile)
         nearest, u, v, index = self._nearest(forms)
@@ -172,7 +173,8 @@ class Renderer:
         fine = self._sample(u, v, row, lower)
         coarse = self._sample(u, v, row, lower + 1.0)
         hit = torch.gt(nearest, 0.0, out=torch.empty_like(nearest))
-        return fine.lerp_(coarse, level - lower).mul_(hit)
+        shaded = fine.lerp_(coarse, level - lower)
+        return shaded.mul_(hit) if self.empty == 0.0 else shaded.sub_(self.empty).mul_(hit).add_(self.empty)
 
     def _sample(self, u: torch.Tensor, v: torch.Tensor, row: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
         """Bilinear atlas look-up; see `build_atlas` for the layout."""
@@ -191,3 +193,11 @@ class Renderer:
 def _mirror(coordinate: torch.Tensor) -> torch.Tensor:
     """Fold a tile coordinate into 0..1 by reflection at the integers."""
     return coordinate.sub_((coordinate * 0.5).round_(), alpha=2.0).abs_()
+
+
+def render_in_chunks(renderer: Renderer, poses: torch.Tensor) -> torch.Tensor:
+    """Log intensity `(M, H, W)` of many poses, a cache-sized part at a time on the CPU."""
+    height, width = renderer.rays.size
+    budget = 100_000 if poses.device.type == "cpu" else 8_000_000
+    size = max(1, budget // (height * width))
+    return torch.cat([renderer.render(poses[k : k + size])[0] for k in range(0, len(poses), size)])

@@ -36,8 +36,8 @@ class Planes:
 
     @property
     def normal(self) -> torch.Tensor:
-        """Unit normals `(G, P, 3)`, `axis_u x axis_v`."""
-        return torch.linalg.cross(self.axis_u, self.axis_v)
+        """Unit normals `(G, P, 3)`, towards the side from which u points right and v down."""
+        return torch.linalg.cross(self.axis_v, self.axis_u)
 
     def to(self, device: torch.device | str) -> Planes:
         """The same scenes on another device."""

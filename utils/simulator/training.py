@@ -2,8 +2,8 @@
 
 A clip has n windows of one frame interval each. Window i covers `[i, i + 1)` frame intervals; its pose and inverse
 depth belong to its middle `i + 0.5`, which is where inference stamps a voxel grid. Windows are adjacent. Bins are
-placed by the borders of the window; a grid from a list of events places them by the first and last event, which differs by
-less than one event spacing.
+placed by the borders of the window; a grid from a list of events places them by the first and last event, which differs
+by less than one event spacing.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from utils.simulator.events import EventSettings, PixelArray, threshold_maps
+from utils.simulator.events import EventSettings, NoiseSource, PixelArray, resting_pixels
 from utils.simulator.layouts import LAYOUTS, PlaneList
 from utils.simulator.motion import CalibratedMotion, MotionRequest, calibrated_motion
-from utils.simulator.renderer import Renderer, pinhole_rays
+from utils.simulator.renderer import Renderer, pinhole_rays, render_in_chunks
 from utils.simulator.scenes import Planes
 from utils.simulator.textures import build_atlas, texture_bank
 from utils.simulator.trajectory import compose, invert
@@ -235,7 +235,7 @@ def render_clip(plan: ClipPlan, height: int, width: int, generator: torch.Genera
     middles = plan.motion.spline.poses(torch.arange(frames, dtype=torch.float64) + 0.5)
     log_intensity = render_in_chunks(renderer, plan.motion.spline.poses(clip_times(plan.steps)).to(device))
     inv_depths = renderer.inverse_depth(middles.to(device))
-    array = pixel_array((height, width), plan.pixels, generator, device)
+    array = resting_pixels((height, width), plan.pixels, generator, device)
     voxels = direct_voxels(log_intensity, plan.steps, plan.frame_us, array)
     events = voxels.new_tensor(0.0) + array.fired / (frames * height * width)
     _add_noise(voxels, plan, generator)
@@ -245,25 +245,6 @@ def render_clip(plan: ClipPlan, height: int, width: int, generator: torch.Genera
         inv_depths = inv_depths / scale
         world_T_cam[:, :3] *= scale
     return voxels, world_T_cam, inv_depths, events
-
-
-def render_in_chunks(renderer: Renderer, poses: torch.Tensor) -> torch.Tensor:
-    """Log intensity `(M, H, W)` of many poses, a cache-sized part at a time on the CPU."""
-    height, width = renderer.rays.size
-    budget = 40_000 if poses.device.type == "cpu" else 8_000_000
-    size = max(1, budget // (height * width))
-    return torch.cat([renderer.render(poses[k : k + size])[0] for k in range(0, len(poses), size)])
-
-
-def pixel_array(shape: tuple[int, int], settings: EventSettings, generator: torch.Generator,
-                device: torch.device | str) -> PixelArray:
-    """Pixels in the middle of their life: the distance to the next event is random."""
-    positive, negative = threshold_maps(shape, settings, generator, device)
-    leak = settings.leak_hz * 1e-6 * positive if settings.leak_hz > 0 else 0.0
-    array = PixelArray(positive, negative, settings.refractory_us, leak)
-    phase = torch.rand(shape, generator=generator).to(device)
-    array.residual = phase * (positive + negative) * 0.999 - negative * 0.999
-    return array
 
 
 def direct_voxels(log_intensity: torch.Tensor, steps: list[int], frame_us: float, array: PixelArray) -> torch.Tensor:
@@ -283,20 +264,6 @@ def direct_voxels(log_intensity: torch.Tensor, steps: list[int], frame_us: float
 def _add_noise(voxels: torch.Tensor, plan: ClipPlan, generator: torch.Generator) -> None:
     """Scatter shot noise and the events of hot pixels over the windows, uniformly in time (in place)."""
     frames, _, height, width = voxels.shape
-    seconds, area = plan.frame_us * 1e-6, height * width
-    shots = _poisson(plan.pixels.shot_hz * seconds * area * frames, generator)
-    where = torch.randint(area, (shots,), generator=generator)
-    sign = torch.randint(2, (shots,), generator=generator) * 2 - 1
-    hot = torch.randint(area, (_poisson(plan.pixels.hot_fraction * area, generator),), generator=generator)
-    if len(hot):
-        rates = plan.pixels.hot_hz * seconds * frames * torch.rand(len(hot), generator=generator) * 2
-        counts = torch.poisson(rates, generator=generator).long()
-        polarity = torch.randint(2, (len(hot),), generator=generator) * 2 - 1
-        where = torch.cat([where, hot.repeat_interleave(counts)])
-        sign = torch.cat([sign, polarity.repeat_interleave(counts)])
-    time = torch.rand(len(where), generator=generator) * frames * (1 - 1e-6)
-    scatter_events(voxels, where.to(voxels.device), time.to(voxels.device), sign.to(voxels.device))
-
-
-def _poisson(mean: float, generator: torch.Generator) -> int:
-    return int(torch.poisson(torch.tensor(float(mean)), generator=generator))
+    noise = NoiseSource(plan.pixels, height * width, generator).draw(0.0, plan.frame_us * frames)
+    time = (noise.t_us / plan.frame_us).clamp(max=frames * (1 - 1e-6)).float()
+    scatter_events(voxels, noise.pixel.to(voxels.device), time.to(voxels.device), noise.sign.to(voxels.device))

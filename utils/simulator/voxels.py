@@ -42,7 +42,7 @@ def scatter_events(voxels: torch.Tensor, pixel: torch.Tensor, time: torch.Tensor
     area = voxels.shape[-2] * voxels.shape[-1]
     window = time.floor()
     bins = (time - window) * (BINS - 1)
-    lower = bins.floor().clamp(max=BINS - 2)
+    lower = bins.floor().clamp(0, BINS - 2)
     share = bins - lower
     cell = (window.long() * BINS + lower.long()) * area + pixel
     flat = voxels.view(-1)

@@ -119,7 +119,8 @@ def _data(options: argparse.Namespace, settings: TrainSettings, start: int, rank
 
         return tartan_source(settings), None
     cache = Path(options.cache) if options.cache else Path(options.runs) / "cache"
-    source = simulated_source(settings, cache / f"rank{rank}" if rank else cache, background=not options.no_background, start_step=start)
+    producer = "elsewhere" if rank else "inline" if options.no_background else "background"
+    source = simulated_source(settings, cache, producer=producer, start_step=start * int(os.environ.get("WORLD_SIZE", "1")))
     validation = validation_clips(settings, cache, options.validation_clips) if rank == 0 and options.validation_clips else None
     return source, validation
 

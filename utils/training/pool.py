@@ -112,12 +112,13 @@ class ClipPool:
         make: makes a shard; called in the background process, hence picklable.
         clips: batch size. frames: frames per clip. sizes: windows (height, width), one is drawn per step.
         shards: pool size. reuse: mean uses of a clip. first: shards needed before the first step.
-        background: False makes shards in this process when they are needed.
+        producer: `background` (a process of its own), `inline` (this process makes shards when they are needed), or
+            `elsewhere` (another trainer with the same cache makes them, this one waits).
     """
 
     def __init__(self, folder: Path, settings: ShardSettings, make: ShardMaker, *, clips: int, frames: int,
                  sizes: tuple[tuple[int, int], ...], shards: int, reuse: int, augment_settings: AugmentSettings,
-                 first: int = 4, background: bool = True, start_step: int = 0, nice: int = 0) -> None:
+                 first: int = 4, producer: str = "background", start_step: int = 0, nice: int = 0) -> None:
         self.folder, self.settings, self.make = folder, settings, make
         self.clips, self.frames_per_clip, self.sizes, self.shards, self.reuse = clips, frames, sizes, shards, reuse
         self.augment_settings, self.first = augment_settings, first
@@ -127,7 +128,8 @@ class ClipPool:
         self._check_writable()
         self._process: Any = None
         self._position: Any = None
-        if background:
+        self.producer = producer
+        if producer == "background":
             context = multiprocessing.get_context("spawn")
             self._position = context.Value("q", self.window(start_step)[1])
             self._process = context.Process(
@@ -170,12 +172,12 @@ class ClipPool:
         return clips
 
     def _wait_for(self, path: Path, number: int) -> None:
-        if self._process is None:
+        if self.producer == "inline":
             ensure_shard(self.folder, number, self.settings, self.make)
             return
         start = time.monotonic()
         while not path.is_file():
-            if not self._process.is_alive():
+            if self._process is not None and not self._process.is_alive():
                 raise DevoError(f"the process that simulates training clips ended (exit code {self._process.exitcode}) before it "
                                 f"wrote {path}; its message is above. Too little memory? Try fewer --shard-clips")
             time.sleep(POLL_SECONDS)

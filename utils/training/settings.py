@@ -52,7 +52,7 @@ class TrainSettings:
         clips: clips per step. sizes: (height, width) windows, one drawn per step.
         structure_only: probability, per step, that poses stay at the truth.
         perturbed: probability, per clip, to start between identity and truth (else at identity).
-        solver_gradient_every: see `devo.unroll_state.UnrollSettings`.
+        solver_gradient_every, match_gradient_every: see `devo.unroll_state.UnrollSettings`.
         score_every: the scorer runs with gradient in every k-th step.
         steps, learning_rate, warmup, schedule, clip_gradient, weight_decay, ema: optimisation; `warmup` in steps, schedule
             onecycle (published, linear), cosine or constant.
@@ -76,6 +76,7 @@ class TrainSettings:
     structure_only: float = 0.1
     perturbed: float = 0.5
     solver_gradient_every: int = 1
+    match_gradient_every: int = 2
     score_every: int = 1
     steps: int = 10000
     learning_rate: float = 8e-4

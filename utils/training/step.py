@@ -60,6 +60,7 @@ class TrainingStep(nn.Module):
         return UnrollSettings(
             steps=wanted.updates, patches_per_image=wanted.patches, structure_only=structure_only,
             initial_frames=wanted.initial_frames, solver_gradient_every=wanted.solver_gradient_every,
+            match_gradient_every=wanted.match_gradient_every,
             probe=wanted.loss.probe > 0, mixed_precision=PRECISIONS[wanted.precision])
 
     def forward(self, clips: TrainingClips, plan: StepPlan) -> dict[str, Tensor]:
@@ -102,6 +103,8 @@ def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> d
         total = total + weights.scores * scores
         parts["scores"] = [scores]
     report = {name: torch.stack(values).detach().mean() for name, values in parts.items() if values}
+    first = result.steps[0]
+    report["start"] = masked_mean(first.start_error.clamp(max=20.0), first.predicted_valid)
     report["direct_first"] = parts["direct"][0].detach()
     report["direct_last"] = parts["direct"][-1].detach()
     if parts["flow"]:

@@ -34,7 +34,7 @@ from utils.training.validate import ValidationSettings, validate
 
 logger = logging.getLogger(__name__)
 
-LOG_NAMES = ("total", "direct", "direct_first", "direct_last", "probe", "flow", "flow_last", "pose", "scores", "confidence")
+LOG_NAMES = ("total", "start", "direct", "direct_first", "direct_last", "probe", "flow", "flow_last", "pose", "scores", "confidence")
 FAILED_IN_A_ROW = 50
 
 
@@ -69,6 +69,8 @@ class Trainer:
         self.network, self.settings, self.run, self.source = network, settings, run, source
         self.validation, self.report, self.rank, self.world = validation, report, rank, world
         self.device = next(network.parameters()).device
+        for part in ("inet", "scorer"):  # without instance norm, channels-last convolutions are twice as fast
+            getattr(network.patchify, part).to(memory_format=torch.channels_last)
         self.module: nn.Module = TrainingStep(network, settings)
         if world > 1:
             devices = [self.device.index] if self.device.type == "cuda" else None
@@ -94,6 +96,7 @@ class Trainer:
         clips = self.source.batch(index).to(self.device)
         plan = plan_step(settings, self.step, generator_for(settings.seed, 3, index))
         self.network.train()
+        self.network.patchify.scorer.requires_grad_(plan.train_scorer)
         losses = self.module(clips, plan)
         self.optimiser.zero_grad(set_to_none=True)
         self.scaler.scale(losses["total"]).backward()

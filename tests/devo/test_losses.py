@@ -1,0 +1,104 @@
+"""Losses against cases that can be computed by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from devo.lietorch import SE3
+from devo.losses import alignment_scale, direct_loss, flow_loss, masked_mean, pose_errors, pose_loss, score_loss
+
+
+def random_poses(clips: int, frames: int, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return SE3.exp(0.3 * torch.randn(clips, frames, 6, generator=generator, dtype=torch.float64)).data
+
+
+def test_masked_mean_ignores_nan_and_gives_zero_without_entries() -> None:
+    values = torch.tensor([1.0, math.nan, 3.0], requires_grad=True)
+    mean = masked_mean(values, torch.tensor([True, False, True]))
+    mean.backward()
+    assert mean.item() == 2.0
+    assert values.grad is not None
+    assert values.grad.tolist() == [0.5, 0.0, 0.5]
+    assert masked_mean(values, torch.zeros(3)).item() == 0.0
+
+
+def test_flow_loss_takes_the_best_pixel_of_each_valid_patch() -> None:
+    truth = torch.zeros(1, 2, 3, 3, 2)
+    coords = torch.full((1, 2, 3, 3, 2), 30.0)
+    coords[0, 0, 1, 2] = torch.tensor([3.0, 4.0])
+    assert flow_loss(coords, truth, torch.tensor([[1.0, 0.0]])).item() == pytest.approx(5.0)
+    assert flow_loss(coords, truth, torch.tensor([[1.0, 1.0]])).item() == pytest.approx((5.0 + 30 * 2**0.5) / 2)
+
+
+def test_direct_loss_clamps_and_stops_the_gradient_of_hopeless_edges() -> None:
+    predicted = torch.tensor([[[3.0, 4.0], [100.0, 0.0]]], requires_grad=True)
+    loss = direct_loss(predicted, torch.zeros(1, 2, 2), torch.ones(1, 2, dtype=torch.bool))
+    loss.backward()
+    assert loss.item() == pytest.approx((5.0 + 20.0) / 2)
+    assert predicted.grad is not None
+    assert predicted.grad[0, 0].tolist() == pytest.approx([0.3, 0.4])
+    assert predicted.grad[0, 1].abs().max() == 0
+
+
+def test_scale_recovers_the_factor_between_similar_paths() -> None:
+    generator = torch.Generator().manual_seed(1)
+    centres = torch.randn(3, 7, 3, generator=generator, dtype=torch.float64)
+    factors = torch.tensor([0.5, 2.0, 40.0], dtype=torch.float64)
+    scale = alignment_scale(centres * factors[:, None, None], centres + 1.0)
+    assert scale.tolist() == pytest.approx([0.5, 2.0, 10.0])
+
+
+def test_scale_without_motion_is_finite() -> None:
+    still, moving = torch.ones(1, 5, 3), torch.randn(1, 5, 3, generator=torch.Generator().manual_seed(2))
+    assert alignment_scale(moving, still).item() == 10.0
+    assert alignment_scale(still, moving).item() == 1.0
+    assert alignment_scale(still, still).item() == 1.0
+
+
+def test_pose_loss_does_not_see_scale_and_world_frame() -> None:
+    truth = random_poses(2, 6, 3)
+    # a similarity of the world: other origin, other unit
+    move = SE3(random_poses(2, 1, 4))
+    moved = (SE3(truth) * move).scale(torch.full((2, 1), 0.25, dtype=torch.float64)).data
+    assert pose_loss(moved, truth)[0].item() < 1e-6
+
+
+def test_pose_errors_of_a_known_rotation() -> None:
+    truth = random_poses(1, 4, 5)
+    turn = SE3.exp(torch.tensor([[[0, 0, 0, 0, 0.1, 0]]], dtype=torch.float64))
+    wrong = truth.clone()
+    wrong[:, 2:3] = (turn * SE3(truth[:, 2:3])).data  # frame 2 looks 0.1 rad aside, its centre stays
+    translation, rotation = pose_errors(wrong, truth)
+    assert rotation.shape == (1, 12)
+    assert sorted(rotation[0].tolist()) == pytest.approx([0.0] * 6 + [0.1] * 6, abs=1e-7)
+    assert translation[0, 0].item() < 1e-7  # pair (0, 1) is not affected
+
+
+def test_pose_loss_gradient_is_a_left_tangent_gradient() -> None:
+    truth, start = random_poses(1, 4, 6), random_poses(1, 4, 7)
+    tangent = torch.zeros(1, 4, 6, dtype=torch.float64, requires_grad=True)
+    rotation = pose_loss(SE3(start).retr(tangent).data, truth)[2]
+    (gradient,) = torch.autograd.grad(rotation, tangent)
+    step = torch.zeros(1, 4, 6, dtype=torch.float64)
+    step[0, 2, 4] = 1e-6
+    plus, minus = (pose_loss(SE3(start).retr(sign * step).data, truth)[2] for sign in (1, -1))
+    assert gradient[0, 2, 4].item() == pytest.approx(((plus - minus) / 2e-6).item(), rel=1e-5)
+
+
+def test_score_loss_by_hand_and_only_scores_learn() -> None:
+    scores = torch.tensor([[0.5, 0.25]], requires_grad=True)
+    errors = torch.tensor([[2.0, 1.0, 50.0]], requires_grad=True)
+    weights = torch.tensor([[[1.0, 1.0], [math.exp(-2.0), math.exp(-2.0)], [1.0, 1.0]]], requires_grad=True)
+    valid, kk = torch.tensor([[True, True, False]]), torch.tensor([0, 1, 0])
+    loss = score_loss(scores, errors, weights, valid, kk)
+    tracked = (1.0 * 0.5 * 2.0 + 2.0 * 0.25 * 1.0) / 2
+    assert loss.item() == pytest.approx(tracked - (math.log(0.5) + math.log(0.25)) / 2)
+    loss.backward()
+    assert errors.grad is None
+    assert weights.grad is None
+    assert scores.grad is not None
+    assert scores.grad[0].tolist() == pytest.approx([1.0 - 1.0, 1.0 - 2.0])
