@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from devo.edges import Segments
 
 GRADIENT_LIMIT = 0.01
+LAYER_NORM_EPS = 1e-3
 
 
 class _GradientClipFunction(torch.autograd.Function):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import warnings
@@ -95,8 +96,15 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Any:
         except pickle.UnpicklingError:
             return read_inert(file)
     except READ_ERRORS as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
-        raise CheckpointError(f"{file} cannot be read as weights ({reason}); copy or download it again") from error
+        raise CheckpointError(
+            f"{file} cannot be read as weights ({_reason(error)}); copy or download it again"
+        ) from error
+
+
+def _reason(error: BaseException) -> str:
+    """First sentence of an error, with its type where it says little by itself."""
+    sentence = str(error).strip().split("\n")[0].split(". ")[0]
+    return f"{type(error).__name__}: {sentence[:120]}".rstrip(": .")
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -137,7 +145,7 @@ def _plain(value: Tensor, name: str, path: str | os.PathLike[str]) -> Tensor:
 def _require_finite(state: Mapping[str, Tensor], where: str) -> None:
     bad = [name for name, value in state.items() if not bool(torch.isfinite(value).all())]
     if bad:
-        raise CheckpointError(f"{where}: NaN or infinite weights in {_some(bad)}; the training that wrote them diverged")
+        raise CheckpointError(f"{where}: NaN or infinite weights in {_some(bad)}; take weights of an earlier step")
 
 
 def _some(names: list[str]) -> str:
@@ -145,7 +153,9 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:MAX_NAMED]) + more
 
 
-def network_from_state(state: Mapping[str, Tensor], patch_selector: str | None = None, where: str = "weights") -> nn.Module:
+def network_from_state(
+    state: Mapping[str, Tensor], patch_selector: str | None = None, where: str = "weights"
+) -> nn.Module:
     """Build the network that fits `state` and load it strictly; see `load_network` for the selector.
 
     Args:
@@ -162,10 +172,10 @@ def network_from_state(state: Mapping[str, Tensor], patch_selector: str | None =
         patch_selector = "scorer" if has_scorer else "gradient" if channels == eVONet.bins else "random"
     patch_selector = patch_selector.lower()
     if patch_selector == "scorer" and not has_scorer:
-        raise CheckpointError(f"{where} holds no scorer; use PATCH_SELECTOR gradient or random, or weights with a scorer")
+        raise CheckpointError(f"{where} holds no scorer; use PATCH_SELECTOR gradient or random")
     if patch_selector != "scorer":
         state = {name: value for name, value in state.items() if not name.startswith(SCORER_PREFIX)}
-    with torch.device("meta"):  # no memory, and above all no random numbers
+    with torch.random.fork_rng(devices=[]):
         network = _build(channels, dims, patch_selector, patch_size)
     _require_match(state, network, where)
     network.load_state_dict(state, strict=True, assign=True)
@@ -259,12 +269,13 @@ def save_checkpoint(path: str | os.PathLike[str], network: nn.Module, **extras: 
         torch.save({"model_state_dict": state, **extras}, temporary)
         torch.load(temporary, map_location="cpu", weights_only=True)
         temporary.replace(target)
-    except pickle.PickleError as error:
+    except (pickle.PickleError, AttributeError, TypeError) as error:
         raise OutputError(f"{target} not written: the extra entries hold more than tensors and plain values") from error
     except (OSError, RuntimeError) as error:
-        raise OutputError(f"{target} not written: {str(error).splitlines()[0]}; check the disk and the folder") from error
+        raise OutputError(f"{target} not written ({_reason(error)}); check the disk and the folder") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
     return target
 
 

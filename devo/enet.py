@@ -71,11 +71,11 @@ class eVONet(nn.Module):  # noqa: N801 - published name
         plot_patches: bool = False,
         patches_per_image: int = 80,
     ) -> Any:
-        """Normalise clips and unroll the odometry over them, see `devo.unroll.unroll`.
+        """Unroll the odometry over raw training clips, see `devo.unroll.unroll`.
 
         `M`, `P` and `plot_patches` are ignored; they are kept for the published signature.
         """
-        from devo.unroll import UnrollSettings, unroll
+        from devo.unroll import unroll  # late: the tracker needs none of the training code
 
-        settings = UnrollSettings(steps=STEPS, patches_per_image=patches_per_image, structure_only=structure_only)
-        return unroll(self, self.normalize(images), poses, disps, intrinsics, settings)
+        options: dict[str, Any] = {"STEPS": STEPS, "structure_only": structure_only}
+        return unroll(self, images, poses, disps, intrinsics, patches_per_image=patches_per_image, **options)

@@ -52,13 +52,13 @@ _ALLOWED = {
 class Inert:
     """Stands in for anything a file asks for that is not plain data; takes every call and every state, does nothing."""
 
-    def __new__(cls, *_: Any, **__: Any) -> Inert:
+    def __new__(cls, *_: Any, **__: Any) -> Inert:  # noqa: D102
         return super().__new__(cls)
 
     def __init__(self, *_: Any, **__: Any) -> None:
         pass
 
-    def __call__(self, *_: Any, **__: Any) -> Inert:
+    def __call__(self, *_: Any, **__: Any) -> Inert:  # noqa: D102
         return self
 
     def __setstate__(self, _: Any) -> None:

@@ -64,7 +64,7 @@ def event_gradient(images: Tensor) -> Tensor:
 
 
 class PatchSelector:
-    """Draws patch positions from score maps.
+    """Draws patch positions from score maps; on maps with fewer cells than patches the cells take turns again.
 
     Methods: `multi` (multinomial over the 4x4 cells, then over the 16 pixels of a cell; at most one patch per cell),
     `topk` (best cells by their maximum), `nms` (the same after non-maximum suppression of touching maxima),
@@ -99,9 +99,6 @@ class PatchSelector:
 
         Returns:
             x, y: each `(frames, ppi)` int64, in [0, w-1] and [0, h-1].
-
-        Raises:
-            InputError: the map has fewer cells than patches are asked for.
         """
         h, w = scores.shape[-2:]
         maps = scores.detach().reshape(-1, h, w).float()
@@ -170,20 +167,17 @@ class PatchSelector:
         parts = self._quadrants(value)
         count = self._picks_per_part(parts, ppi)
         order = parts.argsort(dim=2, descending=True, stable=True)
+        rounds = -(-count // order.shape[2])  # small maps: the cells take turns again
         if self.method == "nms":
             kept = self._quadrants(suppress_neighbours(value, position, padded.shape[-1], self.grid))
             # suppressed cells follow the survivors, best first: they fill up where survivors are too few
             order = order.gather(2, kept.gather(2, order).byte().argsort(dim=2, descending=True, stable=True))
-        cell = _interleave(self._cell_of(order[..., :count], value.shape[-2:]), ppi)
+        cell = _interleave(self._cell_of(order.repeat(1, 1, rounds)[..., :count], value.shape[-2:]), ppi)
         pixel = position.flatten(1).gather(1, cell)
         return pixel % padded.shape[-1], pixel // padded.shape[-1]
 
     def _picks_per_part(self, parts: Tensor, ppi: int) -> int:
-        count = -(-ppi // parts.shape[1])
-        if count > parts.shape[2]:
-            found = f"{parts.shape[1] * parts.shape[2]} cells of 4x4 quarter-resolution pixels"
-            raise InputError(f"{ppi} patches per frame do not fit {found}; take fewer patches or larger frames")
-        return count
+        return -(-ppi // parts.shape[1])
 
     def _quadrants(self, cells: Tensor) -> Tensor:
         """`(F, h1, w1)` to `(F, parts, cells per part)`."""
@@ -218,10 +212,17 @@ def _interleave(picks: Tensor, ppi: int) -> Tensor:
 def _draw(weight: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
     """Draw `count` indices of the last axis without replacement, with probabilities proportional to `weight`.
 
+    More draws than there are entries begin again with all of them.
+
     Exponential races: the largest weight/q with q ~ Exp(1), which is also what `torch.multinomial` does.
     """
-    race = torch.empty_like(weight).exponential_(1.0, generator=generator)
-    return torch.topk(weight / race, count, dim=-1).indices
+    cells = weight.shape[-1]
+    rounds = [min(cells, count - done) for done in range(0, count, cells)]
+    picks = []
+    for size in rounds:
+        race = torch.empty_like(weight).exponential_(1.0, generator=generator)
+        picks.append(torch.topk(weight / race, size, dim=-1).indices)
+    return picks[0] if len(picks) == 1 else torch.cat(picks, dim=-1)
 
 
 def suppress_neighbours(value: Tensor, position: Tensor, width: int, grid: bool) -> Tensor:

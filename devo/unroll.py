@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 BOUNDS_MARGIN = 64.0  # quarter-resolution pixels around the image within which a reprojection is used
 SOLVER_DAMPING = 10.0
 DEPTH_DAMPING = 1e-4
+PROBE_REACH = 3  # frames
+PROBE_BACKWARDS = 0.25
 
 
 class UnrollStep(NamedTuple):
@@ -183,11 +185,10 @@ def _probe(clips: JoinedClips) -> ProbeResult:
 
     device = clips.patches.device
     source = torch.arange(clips.frames, device=device)
-    reach = max(1, min(3, clips.frames - 1))
-    step = torch.randint(1, reach + 1, (clips.frames,)).to(device)
-    step = torch.where(torch.rand(clips.frames).to(device) < 0.75, step, -step)
-    other = source + step
-    other = torch.where((other < 0) | (other >= clips.frames), source - step, other)
+    reach = torch.randint(1, PROBE_REACH + 1, (clips.frames,)).to(device)
+    backwards = torch.rand(clips.frames).to(device) < PROBE_BACKWARDS
+    other = (source + torch.where(backwards, -reach, reach)).clamp(0, clips.frames - 1)
+    other = torch.where(other == source, torch.where(source > 0, source - 1, source + 1), other)
     kk = torch.arange(clips.frames * clips.per_frame, device=device)
     ii, jj, kk = clips.edges(kk // clips.per_frame, other.repeat_interleave(clips.per_frame), kk)
     coords = clips.patches_gt[:, kk, :2].permute(0, 1, 3, 4, 2)

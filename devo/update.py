@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from devo.blocks import GatedResidual, GradientClip, SoftAgg
+from devo.blocks import LAYER_NORM_EPS, GatedResidual, GradientClip, SoftAgg
 from devo.edges import EdgeGroups
 from devo.update_inference import update_in_chunks
 
-LAYER_NORM_EPS = 1e-3
 CORRELATION_WINDOW = 7
 CORRELATION_LEVELS = 2
 
@@ -98,7 +97,7 @@ class Update(nn.Module):
         self, net: Tensor, inp: Tensor, corr: Tensor, groups: EdgeGroups
     ) -> tuple[Tensor, tuple[Tensor, Tensor, None]]:
         previous, following = groups.neighbours
-        weights = self.corr[0].weight.dtype
+        weights = self.norm.weight.dtype
         if not torch.is_autocast_enabled(net.device.type):
             inp, corr = inp.to(weights), corr.to(weights)
         x = self.norm(net + inp + self.corr(corr))

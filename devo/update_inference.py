@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from devo.blocks import LAYER_NORM_EPS, GatedResidual, SoftAgg
 from devo.edges import EdgeGroups, Segments
 
 if TYPE_CHECKING:
-    from devo.blocks import GatedResidual, SoftAgg
     from devo.update import Update
 
 # measured: 1024 to 4096 rows are equally fast, fewer pay for the calls, more for cache misses
@@ -48,7 +48,7 @@ class _Layers:
 
     def __init__(self, update: Update, dtype: torch.dtype) -> None:
         self.dtype = dtype
-        self._cast = {
+        self._cast: dict[nn.Module, tuple[Tensor, Tensor]] = {
             module: (module.weight.to(dtype), module.bias.to(dtype))
             for module in update.modules()
             if isinstance(module, nn.Linear | nn.LayerNorm)
@@ -67,7 +67,7 @@ class _Layers:
         """The correlation MLP, all of it in the type of the matrix products."""
         x = self.mlp(x.to(self.dtype), chain)
         weight, bias = self._cast[chain[3]]
-        return self.linear(functional.layer_norm(x, weight.shape, weight, bias, chain[3].eps).relu_(), chain[5])
+        return self.linear(functional.layer_norm(x, (x.shape[-1],), weight, bias, LAYER_NORM_EPS).relu_(), chain[5])
 
     def soft_aggregation_(self, x: Tensor, module: SoftAgg, piece: _Piece) -> Tensor:
         """Add the pooled and redistributed features of each group to `x` (R, dim) float32, in place."""
@@ -81,15 +81,20 @@ class _Layers:
         handed_back = self.linear(pooled.div_(total).to(self.dtype), module.h).to(x.dtype)
         return x.add_(handed_back.index_select(0, piece.label))
 
-    def gated_residual_(self, x: Tensor, module: GatedResidual) -> Tensor:
-        """`x + sigmoid(gate(x)) * res(x)` in place."""
+    def gated_residual_(self, x: Tensor, module: nn.Module) -> Tensor:
+        """`x + sigmoid(gate(x)) * res(x)` of a `GatedResidual`, in place."""
+        assert isinstance(module, GatedResidual)
         lowered = x.to(self.dtype)
         gate = self.linear(lowered, module.gate[0]).sigmoid_()
         return x.add_(gate.mul_(self.mlp(lowered, module.res)))
 
 
-def _norm(x: Tensor, module: nn.LayerNorm) -> Tensor:
-    return functional.layer_norm(x, (x.shape[-1],), module.weight, module.bias, module.eps)
+def _heads(update: Update) -> tuple[Tensor, Tensor]:
+    """The linear layers of `d` and `w` as one: weight (4, dim), bias (4,)."""
+    revision, confidence = update.d.get_submodule("1"), update.w.get_submodule("1")
+    names = ("weight", "bias")
+    weight, bias = (torch.cat([revision.get_parameter(name), confidence.get_parameter(name)]) for name in names)
+    return weight, bias
 
 
 def _exchange_(x: Tensor, update: Update, layers: _Layers, piece: _Piece) -> Tensor:
@@ -133,17 +138,16 @@ def update_in_chunks(
         state = torch.empty(net.shape, dtype=full, device=net.device)
         for rows in (slice(first, first + chunk_rows) for first in range(0, len(net), chunk_rows)):
             x = net[rows] + inp[rows]
-            state[rows] = _norm(x.to(full).add_(layers.correlation(corr[rows], update.corr)), update.norm)
+            state[rows] = update.norm(x.to(full).add_(layers.correlation(corr[rows], update.corr)))
         for piece in _pieces(groups.patch, chunk_rows):
             x = _exchange_(state.index_select(0, piece.rows), update, layers, piece)
             state.index_copy_(0, piece.rows, layers.soft_aggregation_(x, update.agg_kk, piece))
-        heads_weight = torch.cat([update.d[1].weight, update.w[1].weight])
-        heads_bias = torch.cat([update.d[1].bias, update.w[1].bias])
+        heads_weight, heads_bias = _heads(update)
         heads = torch.empty(len(net), 4, dtype=full, device=net.device)
         for piece in _pieces(groups.frame_pair, chunk_rows):
             x = layers.soft_aggregation_(state.index_select(0, piece.rows), update.agg_ij, piece)
-            for norm, gated in ((update.gru[0], update.gru[1]), (update.gru[2], update.gru[3])):
-                x = layers.gated_residual_(_norm(x, norm), gated)
+            x = layers.gated_residual_(update.gru[0](x), update.gru[1])
+            x = layers.gated_residual_(update.gru[2](x), update.gru[3])
             state.index_copy_(0, piece.rows, x)
             heads.index_copy_(0, piece.rows, functional.linear(x.relu_(), heads_weight, heads_bias))
     return state, heads[:, :2].contiguous(), heads[:, 2:].sigmoid()

@@ -174,18 +174,16 @@ def fit_plane_robust(points: np.ndarray, threshold: float, *, iterations: int = 
     best = planes[int(counts.argmax())]
     normal, offset = best[:3], best[3]
     inliers = np.abs(points @ normal - offset) <= threshold
-    for _ in range(10):  # a few rounds settle which points belong to the plane
+    for _ in range(10):  # of all planes through the inliers the least-squares one is wanted, not the most inclusive
         if not _spans_plane(points[inliers]):
             break
-        centroid, refined = _least_squares_plane(points[inliers])
-        near = np.abs((points - centroid) @ refined) <= threshold
-        if near.sum() < inliers.sum():
+        centroid, normal = _least_squares_plane(points[inliers])
+        offset = normal @ centroid
+        near = np.abs(points @ normal - offset) <= threshold
+        if (near == inliers).all():
             break
-        settled = bool((near == inliers).all())
-        normal, offset, inliers = refined, refined @ centroid, near
-        if settled:
-            break
-    middle = points[inliers].mean(axis=0)
+        inliers = near
+    middle = points[inliers].mean(axis=0) if inliers.any() else points.mean(axis=0)
     return _describe_plane(points, middle - (middle @ normal - offset) * normal, normal, inliers)
 
 

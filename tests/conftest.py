@@ -15,8 +15,9 @@ SHARED = REPOSITORY.parent / "shared"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _two_threads() -> None:
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
+def _one_thread() -> None:
+    # tensors in tests are small: a second thread gains nothing and waits for a core on a busy machine
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

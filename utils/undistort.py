@@ -21,6 +21,7 @@ from utils.events.hdf5_output import create_hdf5
 
 RectifyMap = npt.NDArray[np.float32]
 _CRITERIA = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 100, 0.001)
+_MOST_FAILING_PIXELS = 0.1
 
 
 def undistorted_intrinsics(calibration: Calibration, *, alpha: float = 0.0,
@@ -79,7 +80,27 @@ def rectify_map(calibration: Calibration, *, intrinsics: npt.ArrayLike | None = 
         positions = cv2.undistortPointsIter(pixels, K, D, np.eye(3), P, _CRITERIA)
     else:
         positions = cv2.undistortPoints(pixels, K, D, R=np.eye(3), P=P, criteria=_CRITERIA)
+    positions = positions.reshape(-1, 2)
+    if calibration.is_distorted:
+        _check_inverse(calibration, positions, pixels[:, 0], new)
     return positions.reshape(calibration.height, calibration.width, 2).astype(np.float32), new
+
+
+def _check_inverse(calibration: Calibration, positions: npt.NDArray[Any], pixels: npt.NDArray[np.float32],
+                   intrinsics: npt.NDArray[np.float64]) -> None:
+    """Refuse a map that the lens model does not lead back to the sensor, as wrong coefficients make it.
+
+    A few corner pixels may fail: fitted lens models are often not invertible there.
+    """
+    rays = np.column_stack([(positions - intrinsics[2:]) / intrinsics[:2], np.ones(len(positions))])[:, None]
+    K, D, zero = calibration.camera_matrix, np.array(calibration.coefficients), np.zeros(3)
+    project = cv2.fisheye.projectPoints if calibration.distortion_model == "fisheye" else cv2.projectPoints
+    error = np.abs(project(rays, zero, zero, K, D)[0].reshape(-1, 2) - pixels).max(axis=1)
+    share = float(np.mean(~(error < 1.0)))
+    if share > _MOST_FAILING_PIXELS:
+        raise InputError(f"calibration: the {calibration.distortion_model} distortion {list(calibration.coefficients)} "
+                         f"cannot be undone for {share:.0%} of the pixels; check the coefficients, their order and "
+                         "the model")
 
 
 def undistort_image(image: npt.NDArray[np.uint8], calibration: Calibration,

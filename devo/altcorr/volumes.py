@@ -7,6 +7,7 @@ passes of all lookups add into one buffer, and one more pair of matrix products 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ class Volume:
         self.stride = self.width + self.side
         self.patches, self.frames, self.pixels = gmap.shape[1] // clips, maps.shape[1] // clips, gmap.shape[-1] ** 2
         self.shape = (clips, self.patches * self.pixels, self.frames * self.height * self.stride)
-        self.grad: Tensor | None = None
+        self.holds_gradient = False
         rows = gmap[0].flatten(2).transpose(1, 2).reshape(clips, -1, gmap.shape[2])
         columns = torch.nn.functional.pad(maps[0].permute(0, 2, 3, 1), (0, 0, 0, self.side)).reshape(
             clips, -1, gmap.shape[2]
@@ -50,9 +51,14 @@ class Volume:
 
     def fill(self, rows: Tensor, columns: Tensor) -> None:
         """Multiply (clips, K*P*P, C) patch pixels with (clips, F*H*stride, C) map pixels."""
-        self.values = _reserve(self.side + _size(self.shape), self.compute, rows.device, zero=False)
-        self.values[: self.side] = 0
-        torch.bmm(rows, columns.transpose(1, 2), out=self.values[self.side :].view(self.shape))
+        self.buffer = _reserve(self.side + math.prod(self.shape), self.compute, rows.device)
+        self.buffer[: self.side] = 0
+        torch.bmm(rows, columns.transpose(1, 2), out=self.matrices)
+
+    @property
+    def matrices(self) -> Tensor:
+        """The buffer as (clips, K*P*P, F*H*stride) matrices."""
+        return self.buffer[self.side :].view(self.shape)
 
     def row_starts(self, coords: Tensor, kk: Tensor, jj: Tensor) -> tuple[Tensor, Tensor]:
         """Where the window rows of (E, 2, P*P) positions begin, (E*P*P, D), and the fractions (2, E*P*P, 1)."""
@@ -69,7 +75,7 @@ class Volume:
 
     def look_up(self, coords: Tensor, kk: Tensor, jj: Tensor, out: Tensor) -> None:
         """Blend the windows at (E, 2, P*P) positions into `out` (E, x-shift, y-shift, P*P)."""
-        side, runs = self.side, self.values.as_strided((len(self.values) - self.side + 1, self.side), (1, 1))
+        side, runs = self.side, self.buffer.as_strided((len(self.buffer) - self.side + 1, self.side), (1, 1))
         start, fraction = self.row_starts(coords, kk, jj)
         window = runs.index_select(0, start.view(-1)).view(len(start), -1).to(out.dtype)
         dx, dy = fraction.to(out.dtype)
@@ -81,15 +87,16 @@ class Volume:
 
     def add_gradient(self, coords: Tensor, kk: Tensor, jj: Tensor, grad: Tensor) -> None:
         """Transpose of `look_up`: add gradients (E, x-shift, y-shift, P*P) to those of the products."""
-        total = torch.promote_types(self.compute, torch.float32)
-        if self.grad is None:
-            self.grad = _reserve(len(self.values), total, grad.device, zero=True)
+        if not self.holds_gradient:
+            # the backward pass needs positions only, so the products make room for their gradient
+            self.buffer.zero_()
+            self.holds_gradient = True
         start, fraction = self.row_starts(coords, kk, jj)
-        incoming = grad.permute(0, 3, 2, 1).flatten(0, 1).to(total)
-        dx, dy = fraction[..., 0].to(total)
-        window = spread(incoming, dx, dy)
+        incoming = grad.permute(0, 3, 2, 1).flatten(0, 1)
+        dx, dy = fraction[..., 0].to(grad.dtype)
+        window = spread(incoming, dx, dy).to(self.compute)
         places = start[..., None] + torch.arange(self.side, device=start.device)
-        self.grad.index_add_(0, places.view(-1), window.view(-1))
+        self.buffer.index_add_(0, places.view(-1), window.view(-1))
 
 
 class _Products(torch.autograd.Function):
@@ -108,14 +115,9 @@ class _Products(torch.autograd.Function):
     def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         rows, columns = ctx.saved_tensors
         volume = ctx.volume
-        if volume.grad is None:
-            return None, None, None
-        total, volume.grad = volume.grad[volume.side :].view(volume.shape), None
-        towards_rows, towards_columns = torch.empty_like(rows), torch.empty_like(columns)
-        for clip in range(volume.clips):
-            products = total[clip].to(volume.compute)
-            torch.mm(products, columns[clip], out=towards_rows[clip])
-            torch.mm(products.t(), rows[clip], out=towards_columns[clip])
+        towards_rows = torch.bmm(volume.matrices, columns)
+        towards_columns = torch.bmm(volume.matrices.transpose(1, 2), rows)
+        volume.holds_gradient = False
         return towards_rows, towards_columns, None
 
 
@@ -159,14 +161,8 @@ class Lookup(torch.autograd.Function):
         return (*[None] * 7, *(grad.new_zeros(()) for _ in ctx.volumes))
 
 
-def _size(shape: tuple[int, ...]) -> int:
-    return int(np.prod(shape, dtype=np.int64))
-
-
-def _reserve(size: int, dtype: torch.dtype, device: torch.device, *, zero: bool) -> Tensor:
-    """A large flat tensor; on the CPU from NumPy, which asks for huge pages: touching it first costs half as much."""
+def _reserve(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A large flat tensor; on the CPU from NumPy, which asks for huge pages: touching them first is far cheaper."""
     if device.type != "cpu":
-        return torch.zeros(size, dtype=dtype, device=device)
-    items = size * torch.empty((), dtype=dtype).element_size()
-    memory = np.zeros(items, np.uint8) if zero else np.empty(items, np.uint8)
-    return torch.from_numpy(memory).view(dtype)
+        return torch.empty(size, dtype=dtype, device=device)
+    return torch.from_numpy(np.empty(size * dtype.itemsize, np.uint8)).view(dtype)

@@ -75,7 +75,7 @@ def test_reference_reprojection_and_neighbors(fixture_npz: Fixture) -> None:
 
 
 def dense_difference(t0: int, t1: int, per_frame: bool, seed: int) -> float:
-    world = make_world(seed, jitter_intrinsics=0.05 if per_frame else 0.0)
+    world = make_world(seed, per_frame=4, jitter_intrinsics=0.05 if per_frame else 0.0)
     poses, patches = world.disturbed(0.01, 0.05, 0, seed + 50)
     dx, dz = dense_step(world, poses, patches[0, :, 2, 0, 0], list(range(t0, t1)), ep=1.0)
     new_poses, new_patches = poses.clone(), patches.clone()
@@ -137,17 +137,17 @@ def test_other_image_size_is_the_only_difference() -> None:
 # --- convergence -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_exact_measurements_lead_to_the_truth(seed: int) -> None:
     world = make_world(seed, frames=6, per_frame=16)
-    poses, patches = world.disturbed(0.02, 0.2, 2, seed + 100)
+    poses, patches = world.disturbed(0.01, 0.1, 2, seed + 100)
     costs = []
-    for _ in range(20):
+    for _ in range(12):
         result = solve(world, poses, patches, 2, 6)
         assert result.success
         assert result.valid.all()
         costs.append(float((world.weight[0] * result.residual**2).sum()))
-    assert all(later <= earlier for earlier, later in zip(costs[:10], costs[1:10]))
+    assert all(later <= earlier for earlier, later in zip(costs[:6], costs[1:6]))
     assert tangents(poses, world.poses).abs().max() < 1e-6
     torch.testing.assert_close(patches[:, :, 2], world.patches[:, :, 2], rtol=1e-6, atol=0)
     assert torch.equal(poses[:, :2], world.poses[:, :2])  # the gauge does not move at all
@@ -325,10 +325,8 @@ def test_bad_numbers_do_not_spread(what: str) -> None:
         patches[0, 3, 2] = torch.nan
     elif what == "pixel":
         patches[0, 3, 0] = torch.nan
-    elif what == "camera plane":  # camera 4 at the origin of the world looks along its z axis, the patch has Z = 0 there
-        world.intrinsics[:] = torch.tensor([80.0, 80.0, 80.0, 60.0])
+    elif what == "camera plane":  # camera 4 is so far ahead of camera 0 that the patch of that one has Z = 0
         poses[0, 4] = torch.tensor([0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0])
-        poses[0, 0] = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
         patches[0, 3, 2] = 1.0
     elif what == "behind":
         patches[0, 3, 2] = -8.0
@@ -337,7 +335,8 @@ def test_bad_numbers_do_not_spread(what: str) -> None:
     if what == "camera plane":
         bad = (world.kk == 3) & (world.jj == 4)
     new_poses, new_patches = poses.clone(), patches.clone()
-    result = solve(world, new_poses, new_patches, 1, 5, iterations=2)
+    iterations = 1 if what == "camera plane" else 2  # it moves away from there
+    result = solve(world, new_poses, new_patches, 1, 5, iterations)
     assert result.success
     if what != "behind":
         assert not result.valid[bad].any()
@@ -348,9 +347,9 @@ def test_bad_numbers_do_not_spread(what: str) -> None:
     keep = ~bad
     fastba.BA(
         clean_poses, clean_patches, world.intrinsics, world.target[:, keep], world.weight[:, keep], 1e-4,
-        world.ii[keep], world.jj[keep], world.kk[keep], 1, 5, 2,
+        world.ii[keep], world.jj[keep], world.kk[keep], 1, 5, iterations,
     )  # fmt: skip
-    if what not in ("behind", "camera plane"):
+    if what != "behind":
         torch.testing.assert_close(new_poses, clean_poses, rtol=0, atol=1e-12, equal_nan=True)
     others = torch.arange(30) != 3
     if what == "depth":

@@ -41,6 +41,7 @@ class World:
         noise = torch.randn(1, frames, 6, generator=generator, dtype=torch.float64) * pose_noise
         noise[:, :fixed] = 0
         poses = SE3(self.poses.double()).retr(noise).data.to(self.poses.dtype)
+        poses[:, :fixed] = self.poses[:, :fixed]
         patches = self.patches.clone()
         factor = torch.randn(1, count, 1, 1, generator=generator, dtype=torch.float64) * depth_noise
         patches[:, :, 2] *= torch.exp(factor).to(patches.dtype)

@@ -283,7 +283,6 @@ def test_umeyama_equals_evo_on_random_pairs(with_scale: bool) -> None:
         rotation, translation, scale = umeyama_alignment(source.T, target.T, with_scale)
         worst = max(worst, np.abs(fit.rotation - rotation).max(), np.abs(fit.translation - translation).max(),
                     abs(fit.scale - scale))
-    print('WORST',worst)
     assert worst <= UMEYAMA_AGAINST_EVO
 
 

@@ -134,7 +134,7 @@ def save_h5(path: Path, values: dict[str, np.ndarray]) -> None:
     ({"t": [0.0, 0.1, np.inf, 0.3, 0.4]}, r"event 2: time stamp is inf"),
     ({"t": [2**32 - 20, 2**32 - 10, 2**32 - 1, 3, 9]}, r"event 3: .*32-bit microsecond counter wrapped"),
     ({"t": [2**31 - 20, 2**31 - 10, 2**31 - 1, -2**31, -2**31 + 9]}, r"event 3: .*counter wrapped"),
-    ({"t": np.array([0, 1, 2, 3, 2**63], np.uint64)}, r"event 4: time stamp 9223372036854775808 us is out of any range"),
+    ({"t": np.array([0, 1, 2, 3, 2**63], np.uint64)}, r"event 4: time stamp 9223372036854775808 us is out of"),
     ({"x": [0, 1, 2, 3, 64]}, r"event 4: x = 64 is outside the sensor of 64x48 pixels"),
     ({"y": [0, -1, 2, 3, 4]}, r"event 1: y = -1 is outside"),
     ({"x": [0, 1, 2.5, 3, 4]}, r"event 2: x is 2.5, expected a whole sensor pixel"),

@@ -126,7 +126,7 @@ def _robust_box(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     if len(points):
         p1, p10, p90, p99 = np.percentile(points, (1, 10, 90, 99), axis=0)
-        reach = 0.75 * (p90 - p10)
+        reach = 0.4 * (p90 - p10)  # holds 99 % of a normal distribution
         low, high = np.maximum(p1, p10 - reach), np.minimum(p99, p90 + reach)
     if len(centers):
         low, high = np.minimum(low, centers.min(axis=0)), np.maximum(high, centers.max(axis=0))
@@ -140,7 +140,8 @@ def _frusta(scene: _Scene) -> np.ndarray:
     """`(F, 8, 2, 3)` world line segments of up to 14 camera pyramids, spread evenly over the trajectory."""
     count = min(14, len(scene.poses))
     poses = scene.poses[np.linspace(0, len(scene.poses) - 1, count).astype(int)]
-    x, y, z = 0.026 * scene.diagonal * np.array([1.0, 0.75, 1.5])
+    size = 0.03 * np.sqrt(scene.diagonal * np.median(scene.high - scene.low))  # smaller in long, narrow scenes
+    x, y, z = size * np.array([1.0, 0.75, 1.5])
     tips = np.array([[0, 0, 0], [-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
     edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
     world = np.einsum("fij,pj->fpi", _rotations(poses[:, 3:]), tips) + poses[:, None, :3]
@@ -299,7 +300,7 @@ def _write_texts(figure: Figure, scene: _Scene, title: str, unit: str) -> None:
     if scene.nonfinite:
         notes.append(f"{_count(scene.nonfinite, 'non-finite point')} left out")
     if len(scene.points) < scene.total - scene.outside - scene.nonfinite:
-        notes.append(f"{len(scene.points):,} of them drawn")
+        notes.append(f"{len(scene.points):,} points drawn")
     headline = title or "Trajectory and point cloud"
     figure.text(0.03, 0.945, headline, color=_TEXT, fontsize=20, va="center", weight="bold", parse_math=False)
     figure.text(0.03, 0.908, summary, color=_FAINT, fontsize=12, va="center")

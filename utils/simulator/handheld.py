@@ -12,6 +12,7 @@ from utils.simulator.renderer import Rays, Renderer
 from utils.simulator.trajectory import (
     compose,
     induced_flow,
+    invert,
     quaternion_multiply,
     rotation_vector_to_quaternion,
     spline_weights,
@@ -39,9 +40,9 @@ class MotionPreset:
 
 
 PRESETS = {
-    "slow": MotionPreset(45.0, 0.25, 0.05, 0.0, 0.15),
-    "normal": MotionPreset(100.0, 0.35, 0.12, 0.08, 0.3),
-    "fast": MotionPreset(220.0, 0.4, 0.08, 0.25, 0.5),
+    "slow": MotionPreset(60.0, 0.25, 0.05, 0.0, 0.15),
+    "normal": MotionPreset(120.0, 0.35, 0.12, 0.08, 0.3),
+    "fast": MotionPreset(240.0, 0.4, 0.08, 0.25, 0.5),
 }
 TREMOR_HZ = 7.0
 _GRID_US = 1000.0
@@ -100,12 +101,22 @@ class HandheldPath:
         between = np.arange(per_knot + 1) / per_knot
         while spent < wanted[-1]:
             poses = way_point_poses(spline_at(np.array(knots[-4:]), between)).float()
-            step = self._flow(poses[:-1], poses[1:]).mean((1, 2)).double().numpy()
-            pieces.append(spent + np.cumsum(np.maximum(step, 1e-6)))
+            pieces.append(spent + np.cumsum(self._effort(poses)))
             spent = float(pieces[-1][-1])
             knots.append(next(source))
         travelled = np.concatenate(pieces)
         return np.array(knots), np.interp(wanted, travelled, np.arange(len(travelled)) / per_knot)
+
+    def _effort(self, poses: torch.Tensor) -> np.ndarray:
+        """Mean image motion in pixels between successive poses, but at least a third of what turning and moving would each
+        cause alone: where the two cancel, a hand does not become arbitrarily fast."""
+        flow = self._flow(poses[:-1], poses[1:]).mean((1, 2))
+        moved = (poses[1:, :3] - poses[:-1, :3]).norm(dim=-1)
+        between = compose(invert(poses[:-1]), poses[1:])
+        turned = 2 * between[:, 3:6].norm(dim=-1)
+        nearness = self._renderer.inverse_depth(poses[:-1]).mean((1, 2))
+        alone = self._renderer.rays.focal * (turned + moved * nearness)
+        return torch.maximum(flow, 0.35 * alone).clamp(min=1e-6).double().numpy()
 
     def _flow(self, poses: torch.Tensor, later: torch.Tensor) -> torch.Tensor:
         rays = self._renderer.rays

@@ -76,7 +76,7 @@ def _board_world(focal: float, rng: np.random.Generator, background: bool) -> Wo
     if background:
         collected.add(np.array([0, 0, distance + rng.uniform(0.7, 1.2)]), tilted(rng, 20), name="background")
         tiles.append(_surface(rng, BOARD_TILE))
-    way_points = _wander((0.30, 0.22, 0.22), (0, 0, distance), (0.2, 0.14, 0.0))
+    way_points = _wander((0.30, 0.22, 0.22), (0, 0, distance), (0.3, 0.2, 0.0))
     return World("board", collected.planes(), collected.names, torch.from_numpy(np.stack(tiles)), way_points)
 
 
@@ -125,7 +125,7 @@ def _print_marks(canvas: np.ndarray, cell: float, top: float, columns: int, rows
 
 
 def _wander(region: tuple[float, float, float], target: tuple[float, float, float],
-            spread: tuple[float, float, float], roll: float = 0.12) -> WayPoints:
+            spread: tuple[float, float, float], roll: float = 0.07) -> WayPoints:
     """Way points inside a box around the origin, each looking at a random point around a target."""
 
     def draw(rng: np.random.Generator) -> Iterator[np.ndarray]:

@@ -14,14 +14,14 @@ from typing import Any
 
 import torch
 
-from devo.checkpoint import load_checkpoint_dict
+from devo.checkpoint import read_state_dict
 from devo.data_readers.base import ClipSource, TrainingClips
 from devo.enet import eVONet
 from devo.errors import DevoError, InputError
 from utils.atomic import atomic_path
 from utils.training.settings import TrainSettings
 from utils.training.simulated import simulated_source, validation_clips
-from utils.training.trainer import RunSettings, Trainer, check_dimensions
+from utils.training.trainer import RunSettings, Trainer, check_dimensions, training_state
 
 
 def launch(options: argparse.Namespace) -> int:
@@ -42,10 +42,10 @@ def launch(options: argparse.Namespace) -> int:
     network = eVONet(**settings.network_arguments()).to(device)
     resume = _resume_path(options, folder)
     if options.init and resume is None:
-        state = load_checkpoint_dict(options.init)
-        check_dimensions(Path(options.init), state, settings)
-        network.load_state_dict(state["model_state_dict"])
-    start = int(load_checkpoint_dict(resume)["steps"]) if resume else 0
+        weights = read_state_dict(options.init)
+        check_dimensions(Path(options.init), {"model_state_dict": weights}, settings)
+        network.load_state_dict(weights)
+    start = int(training_state(resume).get("steps", 0)) if resume else 0
     source, validation = _data(options, settings, start, rank)
     trainer = Trainer(network, settings, run, source, validation, report=_reporter(rank), rank=rank, world=world)
     try:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from devo.checkpoint import load_checkpoint_dict, save_checkpoint
+from devo.checkpoint import read_checkpoint, save_checkpoint
 from devo.data_readers.base import ClipSource, TrainingClips
 from devo.enet import eVONet
 from devo.errors import CheckpointError, DevoError
@@ -205,7 +205,7 @@ class Trainer:
         Raises:
             CheckpointError: not such a checkpoint, or of a network with other dimensions.
         """
-        state = load_checkpoint_dict(path)
+        state = training_state(path)
         missing = {"model_state_dict", "optimizer_state_dict", "average", "random", "steps"} - set(state)
         if missing:
             raise CheckpointError(f"{path} cannot be resumed, it lacks {sorted(missing)[0]!r}; use --init to start from its weights")
@@ -218,6 +218,18 @@ class Trainer:
         self.step, self.best, self.skipped = int(state["steps"]), float(state["best"]), int(state["skipped"])
         self.trained_seconds = float(state.get("seconds", 0.0))
         restore_random_state(state["random"])
+
+
+def training_state(path: str | Path) -> dict[str, Any]:
+    """Content of a training checkpoint.
+
+    Raises:
+        CheckpointError: unreadable, or without `model_state_dict`.
+    """
+    state = read_checkpoint(path)
+    if not isinstance(state, dict) or "model_state_dict" not in state:
+        raise CheckpointError(f"{path} is no training checkpoint: it lacks 'model_state_dict'")
+    return state
 
 
 def figure_of_merit(figures: dict[str, float]) -> float:
