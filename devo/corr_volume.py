@@ -32,8 +32,15 @@ class CorrelationVolume:
         levels: pooling factors of the maps.
     """
 
-    def __init__(self, fmap: Tensor, gmap: Tensor, clips: int, keep: float = 0.2, dtype: torch.dtype = torch.float32,
-                 levels: tuple[int, ...] = (1, 4)) -> None:
+    def __init__(
+        self,
+        fmap: Tensor,
+        gmap: Tensor,
+        clips: int,
+        keep: float = 0.2,
+        dtype: torch.dtype = torch.float32,
+        levels: tuple[int, ...] = (1, 4),
+    ) -> None:
         frames = fmap.shape[1]
         patches, pixels = gmap.shape[1], gmap.shape[-1] ** 2
         self.per_clip, self.pixels, self.clips = patches // clips, pixels, clips
@@ -115,11 +122,11 @@ class _Build(torch.autograd.Function):
         store = torch.empty(count + 2 * MARGIN * (level.column + 1), dtype=dtype, device=maps.device)
         edge = MARGIN * (level.column + 1)
         store[:edge] = 0
-        store[edge + count:] = 0
-        products = store[edge:edge + count].view(volume.clips, frames, rows.shape[1], level.area)
+        store[edge + count :] = 0
+        products = store[edge : edge + count].view(volume.clips, frames, rows.shape[1], level.area)
         for clip in range(volume.clips):
             left = rows[clip].to(dtype).expand(frames, -1, -1)
-            torch.bmm(left, padded[clip * frames:(clip + 1) * frames], out=products[clip])
+            torch.bmm(left, padded[clip * frames : (clip + 1) * frames], out=products[clip])
         level.products = store
         ctx.level = level
         ctx.save_for_backward(rows, maps)
@@ -133,7 +140,7 @@ class _Build(torch.autograd.Function):
             return torch.zeros_like(rows), torch.zeros_like(maps), None, None
         volume = level.volume
         kept = volume.pairs.shape[1]
-        gradient = level.gradient[MARGIN * (level.column + 1):][: len(maps) * kept * volume.pixels * level.area]
+        gradient = level.gradient[MARGIN * (level.column + 1) :][: len(maps) * kept * volume.pixels * level.area]
         gradient = gradient.view(len(maps), kept * volume.pixels, level.area)
         clip = torch.arange(len(maps), device=maps.device)[:, None] // volume.frames_per_clip
         chosen = (clip * volume.per_clip + volume.pairs).view(-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,17 +40,19 @@ class Segments:
         return cls(label, len(starts), order, torch.cat([starts, starts.new_tensor([edges])]))
 
     def chunks(self, rows: int) -> list[tuple[int, int, int, int]]:
-        """Cut the sorted edges into pieces of whole groups and about `rows` edges.
+        """Cut the sorted edges into pieces of whole groups and at most `rows` edges.
 
         Returns:
-            `(first edge, last edge + 1, first group, last group + 1)` of each piece; a group larger than `rows` is
-            a piece of its own or part of a larger one.
+            `(first edge, last edge + 1, first group, last group + 1)` of each piece; a group larger than `rows` is a piece
+            of its own.
         """
-        edges = len(self.order)
-        wanted = torch.arange(0, edges, rows, device=self.start.device)
-        groups = torch.unique(torch.searchsorted(self.start, wanted)).tolist() + [self.count]
         ends = self.start.tolist()
-        return [(ends[a], ends[b], a, b) for a, b in zip(groups[:-1], groups[1:]) if b > a]
+        pieces, group = [], 0
+        while group < self.count:
+            after = max(group + 1, bisect.bisect_right(ends, ends[group] + rows) - 1)
+            pieces.append((ends[group], ends[after], group, after))
+            group = after
+        return pieces
 
 
 @dataclass(frozen=True)

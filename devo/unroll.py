@@ -86,8 +86,17 @@ class UnrollResult(NamedTuple):
     probe: ProbeResult | None
 
 
-def unroll(network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor, *, STEPS: int = 12,
-           structure_only: bool = False, patches_per_image: int = 80) -> list[UnrollStep]:
+def unroll(
+    network: eVONet,
+    images: Tensor,
+    poses: SE3,
+    disps: Tensor,
+    intrinsics: Tensor,
+    *,
+    STEPS: int = 12,
+    structure_only: bool = False,
+    patches_per_image: int = 80,
+) -> list[UnrollStep]:
     """Training pass with the published schedule on raw clips; normalises `images` as `network.norm` says.
 
     Arguments as in `unroll_clips`, `STEPS` updates; one `UnrollStep` per update.
@@ -96,8 +105,15 @@ def unroll(network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsic
     return unroll_clips(network, network.normalize(images), poses, disps, intrinsics, settings).steps
 
 
-def unroll_clips(network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor,
-                 settings: UnrollSettings = UnrollSettings(), start_fraction: Tensor | None = None) -> UnrollResult:  # noqa: B008
+def unroll_clips(
+    network: eVONet,
+    images: Tensor,
+    poses: SE3,
+    disps: Tensor,
+    intrinsics: Tensor,
+    settings: UnrollSettings = UnrollSettings(),
+    start_fraction: Tensor | None = None,
+) -> UnrollResult:  # noqa: B008
     """Run the training pass on B clips of n frames.
 
     Args:
@@ -148,18 +164,41 @@ def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, m
     with contextlib.nullcontext() if differentiable else torch.no_grad():
         for _ in range(settings.solver_iterations):
             clips.poses, clips.patches = BA(
-                clips.poses, clips.patches, clips.intrinsics, target, weight, DEPTH_DAMPING, ii, jj, kk, bounds,
-                ep=SOLVER_DAMPING, fixedp=1, structure_only=settings.structure_only, clips=clips.clips, blocks=graph.blocks)
+                clips.poses,
+                clips.patches,
+                clips.intrinsics,
+                target,
+                weight,
+                DEPTH_DAMPING,
+                ii,
+                jj,
+                kk,
+                bounds,
+                ep=SOLVER_DAMPING,
+                fixedp=1,
+                structure_only=settings.structure_only,
+                clips=clips.clips,
+                blocks=graph.blocks,
+            )
     truth = graph.coords_gt[:, :, middle, middle].reshape(1, -1, 2)
     start_error = (centre - truth).norm(dim=-1)
     near = graph.select(graph.near)
     moved = pops.transform(clips.poses, clips.patches, clips.intrinsics, *near) if differentiable else None
     full = _full_report(clips, graph, weight) if last else (None,) * 7
     return UnrollStep(
-        graph.valid[:, graph.near].reshape(1, -1), moved,
+        graph.valid[:, graph.near].reshape(1, -1),
+        moved,
         graph.coords_gt[:, graph.near].reshape(1, -1, *graph.coords_gt.shape[2:]),
-        clips.poses_of(graph.frames) if differentiable else None, clips.patches, 0.0, *full,
-        target, truth, graph.visible.reshape(1, -1), weight, start_error)
+        clips.poses_of(graph.frames) if differentiable else None,
+        clips.patches,
+        0.0,
+        *full,
+        target,
+        truth,
+        graph.visible.reshape(1, -1),
+        weight,
+        start_error,
+    )
 
 
 def _full_report(clips: JoinedClips, graph: GrowingGraph, weight: Tensor) -> tuple[Tensor | None, ...]:
@@ -171,9 +210,15 @@ def _full_report(clips: JoinedClips, graph: GrowingGraph, weight: Tensor) -> tup
     with torch.no_grad():
         coords = pops.transform(clips.poses, clips.patches, clips.intrinsics, *edges)
     chosen = weight.detach().view(clips.clips, -1, 2)[:, local].reshape(1, -1, 2)
-    return (clips.scores, graph.valid[:, local].reshape(1, -1), coords,
-            graph.coords_gt[:, local].reshape(1, -1, *graph.coords_gt.shape[2:]), chosen, edges[2],
-            graph.distance[local].repeat(clips.clips))
+    return (
+        clips.scores,
+        graph.valid[:, local].reshape(1, -1),
+        coords,
+        graph.coords_gt[:, local].reshape(1, -1, *graph.coords_gt.shape[2:]),
+        chosen,
+        edges[2],
+        graph.distance[local].repeat(clips.clips),
+    )
 
 
 def _probe(clips: JoinedClips) -> ProbeResult:
@@ -181,7 +226,6 @@ def _probe(clips: JoinedClips) -> ProbeResult:
 
     This is what the tracker does to find out whether the camera moved at all, before anything is known.
     """
-    from devo import projective_ops as pops
 
     device = clips.patches.device
     source = torch.arange(clips.frames, device=device)
@@ -204,9 +248,14 @@ def _probe(clips: JoinedClips) -> ProbeResult:
 
 def _check_shapes(images: Tensor, disps: Tensor, intrinsics: Tensor) -> None:
     if images.dim() != 5 or images.shape[-1] % 4 or images.shape[-2] % 4:
-        raise InputError(f"images have shape {tuple(images.shape)}; expected (clips, frames, channels, H, W) with H and W "
-                         "multiples of 4, so crop or pad them")
+        raise InputError(
+            f"images have shape {tuple(images.shape)}; expected (clips, frames, channels, H, W) with H and W "
+            "multiples of 4, so crop or pad them"
+        )
     clips, frames, _, height, width = images.shape
-    for name, value, expected in (("disps", disps, (clips, frames, height, width)), ("intrinsics", intrinsics, (clips, frames, 4))):
+    for name, value, expected in (
+        ("disps", disps, (clips, frames, height, width)),
+        ("intrinsics", intrinsics, (clips, frames, 4)),
+    ):
         if tuple(value.shape) != expected:
             raise InputError(f"{name} has shape {tuple(value.shape)}; expected {expected} to match the images")

@@ -56,8 +56,9 @@ class UnrollSettings:
 class JoinedClips:
     """Features, truth and current estimate of all clips of one step."""
 
-    def __init__(self, network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor,
-                 settings: UnrollSettings) -> None:
+    def __init__(
+        self, network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor, settings: UnrollSettings
+    ) -> None:
         from devo.corr_volume import CorrelationVolume
         from devo.lietorch import SE3
 
@@ -68,13 +69,17 @@ class JoinedClips:
         flat = self.clips * self.frames
         disps = disps[..., 1::4, 1::4]
         with self.autocast():
-            fmap, gmap, imap, patches, _, *rest = network.patchify(images, patches_per_image=self.per_frame, disps=disps)
+            fmap, gmap, imap, patches, _, *rest = network.patchify(
+                images, patches_per_image=self.per_frame, disps=disps
+            )
         self.scores: Tensor | None = rest[0] if rest else None
         self.height, self.width = fmap.shape[-2:]
         self.patches_gt = patches.detach().float()
         self.patches = self._with_depth(torch.rand_like(self.patches_gt[:, :, :1, :1, :1]))
         fmap = fmap.float().reshape(1, flat, *fmap.shape[2:])
-        self.correlate = CorrelationVolume(fmap, gmap.float(), self.clips, dtype=settings.mixed_precision or torch.float32)
+        self.correlate = CorrelationVolume(
+            fmap, gmap.float(), self.clips, dtype=settings.mixed_precision or torch.float32
+        )
         self.context = imap.reshape(flat * self.per_frame, -1)
         self.intrinsics = (intrinsics / network.RES).reshape(1, flat, 4)
         self.nearest_point_free = -F.max_pool2d(-disps.reshape(flat, 1, *disps.shape[-2:]), 3, 1, 1)[:, 0]
@@ -113,10 +118,10 @@ class JoinedClips:
 
         if not self.settings.structure_only:
             poses = self.poses.data.view(self.clips, self.frames, 7)
-            poses = torch.cat([poses[:, :new], poses[:, new - 1:new].expand(-1, self.frames - new, -1)], dim=1)
+            poses = torch.cat([poses[:, :new], poses[:, new - 1 : new].expand(-1, self.frames - new, -1)], dim=1)
             self.poses = SE3(poses.reshape(1, -1, 7))
         patches = self.patches.view(self.clips, self.frames, self.per_frame, *self.patches.shape[2:]).clone()
-        recent = patches[:, max(new - 2, 0):new, :, 2].reshape(self.clips, -1)
+        recent = patches[:, max(new - 2, 0) : new, :, 2].reshape(self.clips, -1)
         patches[:, new, :, 2] = recent.median(dim=1).values.view(-1, 1, 1, 1)
         self.patches = patches.view_as(self.patches)
 
@@ -130,28 +135,43 @@ class JoinedClips:
         """Global indices, clip-major, of edges given for one clip."""
         clip = torch.arange(self.clips, device=ii.device)[:, None]
         frames = clip * self.frames
-        return ((ii[None] + frames).reshape(-1), (jj[None] + frames).reshape(-1),
-                (kk[None] + frames * self.per_frame).reshape(-1))
+        return (
+            (ii[None] + frames).reshape(-1),
+            (jj[None] + frames).reshape(-1),
+            (kk[None] + frames * self.per_frame).reshape(-1),
+        )
 
     @torch.no_grad()
     def truth(self, ii: Tensor, jj: Tensor, kk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """True reprojections (1,E,P,P,2), in front of the camera (1,E), and visible as well (1,E)."""
         from devo import projective_ops as pops
 
-        coords, valid = pops.transform(self.poses_gt, self.patches_gt, self.intrinsics, ii, jj, kk, depth=True, valid=True)
+        coords, valid = pops.transform(
+            self.poses_gt, self.patches_gt, self.intrinsics, ii, jj, kk, depth=True, valid=True
+        )
         coords, inv_z = coords[..., :2], coords[..., 2]
         middle = coords.shape[2] // 2
         centre = coords[0, :, middle, middle]
         inv_depth = inv_z[0, :, middle, middle] * self.patches_gt[0, :, 2, middle, middle].index_select(0, kk)
         column, row = centre[:, 0].round(), centre[:, 1].round()
         inside = (column >= 0) & (row >= 0) & (column < self.width) & (row < self.height)
-        cell = (jj * self.height + row.clamp(0, self.height - 1).long()) * self.width + column.clamp(0, self.width - 1).long()
+        cell = (jj * self.height + row.clamp(0, self.height - 1).long()) * self.width + column.clamp(
+            0, self.width - 1
+        ).long()
         hidden = self.nearest_point_free.reshape(-1)[cell] > inv_depth * (1.0 + DEPTH_TOLERANCE)
         valid = valid.bool()
         return coords, valid, valid & (inside & ~hidden)[None]
 
-    def update(self, net: Tensor, coords: Tensor, ii: Tensor, jj: Tensor, kk: Tensor, groups: EdgeGroups,
-               match_gradient: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+    def update(
+        self,
+        net: Tensor,
+        coords: Tensor,
+        ii: Tensor,
+        jj: Tensor,
+        kk: Tensor,
+        groups: EdgeGroups,
+        match_gradient: bool = True,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """One update of the hidden state, `(net, delta, weight)`, at reprojections (1,E,P,P,2)."""
         with contextlib.nullcontext() if match_gradient else torch.no_grad():
             corr = self.correlate(kk, jj, coords.permute(0, 1, 4, 2, 3))
@@ -179,14 +199,19 @@ class GrowingGraph:
         clips = self.source
         ii = kk // clips.per_frame
         coords, valid, visible = clips.truth(*clips.edges(ii, jj, kk))
-        new = coords.view(clips.clips, -1, *coords.shape[2:]), valid.view(clips.clips, -1), visible.view(clips.clips, -1)
+        new = (
+            coords.view(clips.clips, -1, *coords.shape[2:]),
+            valid.view(clips.clips, -1),
+            visible.view(clips.clips, -1),
+        )
         zeros = self.net.new_zeros(clips.clips, len(kk), self.net.shape[2])
         if len(self.kk) == 0:
             self.coords_gt, self.valid, self.visible = new
             self.net = zeros
         else:
             self.coords_gt, self.valid, self.visible = (
-                torch.cat([fresh, old], dim=1) for fresh, old in zip(new, (self.coords_gt, self.valid, self.visible)))
+                torch.cat([fresh, old], dim=1) for fresh, old in zip(new, (self.coords_gt, self.valid, self.visible))
+            )
             self.net = torch.cat([zeros, self.net], dim=1)
         self.ii, self.jj, self.kk = (torch.cat(pair) for pair in ((ii, self.ii), (jj, self.jj), (kk, self.kk)))
 

@@ -24,16 +24,33 @@ if TYPE_CHECKING:
 # measured: 1024 to 4096 rows are equally fast, fewer pay for the calls, more for cache misses
 CHUNK_ROWS = 2048
 CUDA_CHUNK_ROWS = 65536
+# Matrix products on the CPU are compiled for each new number of rows, which costs ten times the product itself, and
+# a tracker's graph has other sizes in every frame. So rows and groups are padded to multiples of these.
+ROW_STEP = 1
+GROUP_STEP = 1
 
 
 class _Piece:
-    """Rows of one chunk: edges sorted by group, with group numbers counted from 0 inside the chunk."""
+    """Rows of one chunk: edges sorted by group, with group numbers counted from 0 inside the chunk.
+
+    Attributes:
+        size: number of edges; padding follows them.
+        edges: edge of each row.
+        rows: the same, with 0 for padding.
+        label: group of each row; padding has a group of its own.
+        count: number of groups with padding.
+        heads, tails: first and last row of each group.
+    """
 
     def __init__(self, segments: Segments, bounds: tuple[int, int, int, int]) -> None:
         first, last, first_group, last_group = bounds
-        self.rows = segments.order[first:last]
-        self.label = segments.label.index_select(0, self.rows) - first_group
-        self.count = last_group - first_group
+        self.size = last - first
+        padding = (0, -self.size % ROW_STEP)
+        self.edges = segments.order[first:last]
+        self.rows = functional.pad(self.edges, padding)
+        label = segments.label.index_select(0, self.edges) - first_group
+        self.label = functional.pad(label, padding, value=last_group - first_group)
+        self.count = -(-(last_group - first_group + 1) // GROUP_STEP) * GROUP_STEP
         starts = segments.start[first_group : last_group + 1] - first
         self.heads, self.tails = starts[:-1], starts[1:] - 1
 
@@ -41,6 +58,13 @@ class _Piece:
 def _pieces(segments: Segments, rows: int) -> Iterator[_Piece]:
     for bounds in segments.chunks(rows):
         yield _Piece(segments, bounds)
+
+
+def _slices(edges: int, rows: int) -> Iterator[slice]:
+    """Consecutive slices of `rows` edges; the last one reaches back into its predecessor to a multiple of ROW_STEP."""
+    for first in range(0, edges, rows):
+        last = min(first + rows, edges)
+        yield slice(max(0, first - (first - last) % ROW_STEP), last)
 
 
 class _Layers:
@@ -78,6 +102,7 @@ class _Layers:
         weight = score.sub_(peak.index_select(0, piece.label)).exp_()
         total = torch.zeros_like(peak).scatter_add_(0, index, weight)
         pooled = torch.zeros_like(peak).scatter_add_(0, index, weight.mul_(self.linear(lowered, module.f)))
+        total.clamp_(min=1.0)  # the peak of a group contributes 1, so only groups of padding are below
         handed_back = self.linear(pooled.div_(total).to(self.dtype), module.h).to(x.dtype)
         return x.add_(handed_back.index_select(0, piece.label))
 
@@ -136,18 +161,19 @@ def update_in_chunks(
     with torch.autocast(net.device.type, enabled=False):
         layers = _Layers(update, dtype)
         state = torch.empty(net.shape, dtype=full, device=net.device)
-        for rows in (slice(first, first + chunk_rows) for first in range(0, len(net), chunk_rows)):
+        for rows in _slices(len(net), chunk_rows):
             x = net[rows] + inp[rows]
             state[rows] = update.norm(x.to(full).add_(layers.correlation(corr[rows], update.corr)))
         for piece in _pieces(groups.patch, chunk_rows):
             x = _exchange_(state.index_select(0, piece.rows), update, layers, piece)
-            state.index_copy_(0, piece.rows, layers.soft_aggregation_(x, update.agg_kk, piece))
+            state.index_copy_(0, piece.edges, layers.soft_aggregation_(x, update.agg_kk, piece)[: piece.size])
         heads_weight, heads_bias = _heads(update)
         heads = torch.empty(len(net), 4, dtype=full, device=net.device)
         for piece in _pieces(groups.frame_pair, chunk_rows):
             x = layers.soft_aggregation_(state.index_select(0, piece.rows), update.agg_ij, piece)
             x = layers.gated_residual_(update.gru[0](x), update.gru[1])
             x = layers.gated_residual_(update.gru[2](x), update.gru[3])
-            state.index_copy_(0, piece.rows, x)
-            heads.index_copy_(0, piece.rows, functional.linear(x.relu_(), heads_weight, heads_bias))
+            x = x[: piece.size]
+            state.index_copy_(0, piece.edges, x)
+            heads.index_copy_(0, piece.edges, functional.linear(x.relu_(), heads_weight, heads_bias))
     return state, heads[:, :2].contiguous(), heads[:, 2:].sigmoid()

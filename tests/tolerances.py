@@ -13,10 +13,11 @@ TRANSFORM = 1e-4  # of the largest value; pixels 2.2e-7, Jacobians 3.5e-7
 REPROJECTION = 1e-5  # pixels relative to 1 + |pixel|; 3.0e-6
 REPROJECT_EDGES = 1e-5  # of the largest pixel, against transform; 2.2e-7
 BA_ONE_STEP = 1e-4  # poses; 5.5e-5
-# Depths after one step: 2.8e-4. The free scale has an eigenvalue of 6 beside 3.5e5, so the float32 reference itself is
-# uncertain there: its formulas in float32 with another order of summation differ from it by 3.6e-4, in float64 by 2.8e-4.
+# Depths: Euclidean norm of the error over that of the depths, 1.9e-4. The free scale has an eigenvalue of 6 beside
+# 3.5e5, so the float32 reference is itself uncertain there: its own formulas differ from it by 2.8e-4 at most in
+# float64, and by 3.6e-4 in float32 with another order of summation.
 BA_ONE_STEP_DEPTHS = 5e-4
-BA_TWO_STEPS = 1e-3  # poses 9.4e-5, depths 8.2e-4
+BA_TWO_STEPS = 1e-3  # poses 9.4e-5, depths (as above) 2.2e-4
 BA_TRAINING = 1e-3  # relative and absolute; poses 1.2e-4, depths 5.0e-4
 BA_TRAINING_GRADIENT = 1e-3  # of the largest entry; target 1.7e-4, weight 9.0e-5
 BA_CLIPS = 1e-4  # float32, joined against separate clips
@@ -25,6 +26,11 @@ BA_DENSE_STEP = 1e-7  # float64, against a dense system with numeric Jacobian
 # --- correlation --------------------------------------------------------------------------------------------
 
 # --- networks -----------------------------------------------------------------------------------------------
+NETWORK_PARITY = 1e-4  # network_small.npz, values up to 5; observed 2.4e-6 (maps), 2.0e-6 (update)
+UPDATE_CHUNKS = 1e-5  # chunk sizes and edge orders against each other, float32, values up to 5
+UPDATE_BFLOAT16 = 0.05  # bfloat16 against float32 linear layers, values of deviation 1
+ENCODER_BFLOAT16 = 0.1  # bfloat16 against float32 feature maps, of their largest value
+NORMALIZE = 2e-6  # against float64; observed 2.6e-7
 
 # --- tracker ------------------------------------------------------------------------------------------------
 TRACKER_ORACLE_POSES = 5e-3  # a change of 1e-6 in the initial inverse depths moves the reference by 1.2e-3
@@ -42,6 +48,10 @@ RECTIFY_ROUND_TRIP_FISHEYE = 5e-5  # pixels; worst 1.45e-5, float32 map of +-700
 UMEYAMA_AGAINST_EVO = 1e-9  # 100 random pairs, rotation, translation and scale: worst 2.2e-14
 
 # --- simulator ----------------------------------------------------------------------------------------------
+SIMULATOR_DEPTH = 1e-5
+SIMULATOR_SURFACE = 1e-4
+SIMULATOR_CROSSING_TIME = 2e-4
+SIMULATOR_VOXEL = 1e-3
 
 # --- training -----------------------------------------------------------------------------------------------
 CORRELATION_VOLUME = 1e-4  # volume against direct correlation, values up to 40 and gradients; observed 1e-5

@@ -61,7 +61,8 @@ def corr(
         keep = draw_kept_edges(len(ii), dropout, coords.device, generator)
     side, patch, channels = 2 * radius + 2, fmap1.shape[-1], fmap1.shape[2]
     chunk = chunk_edges or max(1, CHUNK_ELEMENTS // max(1, side * side * patch * patch * channels))
-    return _Corr.apply(fmap1, fmap2, coords.detach(), ii, jj, radius, keep, chunk)
+    with torch.autocast(fmap1.device.type, enabled=False):
+        return _Corr.apply(fmap1, fmap2, coords.detach(), ii, jj, radius, keep, chunk)
 
 
 def draw_kept_edges(edges: int, keep: float, device: torch.device, generator: torch.Generator | None) -> Tensor:
@@ -149,6 +150,7 @@ class _Windows:
     def __init__(self, coords: Tensor, jj: Tensor, maps: Tensor, radius: int) -> None:
         patch = coords.shape[-1]
         base, fraction = split_coords(coords.flatten(2).transpose(0, 1).flatten(1))
+        base = base.long()
         self.dx, self.dy = fraction.to(maps.dtype)
         frame = jj.repeat_interleave(patch * patch)
         self.rows, self.inside = window_rows(base[0], base[1], frame, (maps.shape[-2], maps.shape[-1]), radius)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from devo.altcorr.correlation import corr
-from devo.altcorr.windows import FAR
+from devo.altcorr.windows import split_coords
 from devo.errors import InputError
 
 CHUNK_BYTES = 1 << 23
@@ -53,7 +53,7 @@ def corr_features(
         found = ", ".join(f"{tuple(level.shape)} {level.dtype}" for level in pyramid) or "nothing"
         raise InputError(f"corr_features got the pyramid {found}; expected equal frames, channels and {gmap.dtype}")
     out = gmap.new_empty(edges, side, side, patch * patch, levels)
-    with torch.no_grad():
+    with torch.no_grad(), torch.autocast(gmap.device.type, enabled=False):
         if gmap.is_cuda:
             _by_corr(out, gmap, pyramid, coords, kk, jj, radius)
         elif edges:
@@ -110,9 +110,8 @@ class _Level:
     def __init__(self, maps: Tensor, coords: Tensor, radius: int) -> None:
         self.maps, self.side = maps, 2 * radius + 2
         height, width = maps.shape[-2:]
-        floor = coords.floor()
-        # integers up to FAR are exact in float32, in which all of this runs vectorised
-        base = floor.nan_to_num(nan=-FAR, posinf=FAR, neginf=-FAR).clamp_(-FAR, FAR)
+        # positions stay floating point as long as possible: that arithmetic is vectorised, and exact up to FAR
+        base, fraction = split_coords(coords)
         lowest = base.amin(1)
         spread = (base.amax(1) - lowest).amax(0)
         self.window = margin = _best_window(spread, self.side, coords.shape[1])
@@ -122,7 +121,7 @@ class _Level:
         inner = (base - (radius + corner)[:, None]).clamp_(0, self.window - self.side)
         self.start = (corner[1] + margin).long() * self.stride + (corner[0] + margin).long()
         self.inner = (inner[1] * self.window + inner[0]).t().contiguous().long()
-        fraction = (coords - floor).to(torch.promote_types(maps.dtype, torch.float32))
+        fraction = fraction.to(torch.promote_types(maps.dtype, torch.float32))
         self.fraction = fraction.transpose(1, 2).flatten(1)[..., None]
         self.left_over = torch.nonzero(spread > self.window - self.side).squeeze(1)
 

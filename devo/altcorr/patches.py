@@ -37,7 +37,7 @@ def patchify(net: Tensor, coords: Tensor, radius: int, mode: str = "bilinear") -
     if extension is not None:
         return extension.patchify(net, coords, radius, mode)
     base, fraction = split_coords(coords.detach())
-    window = _Windows.apply(net, base, radius)
+    window = _Windows.apply(net, base.long(), radius)
     if mode != "bilinear":
         return window
     dx, dy = fraction.to(torch.promote_types(net.dtype, coords.dtype)).unsqueeze(2).unbind(-1)

@@ -20,13 +20,12 @@ def split_coords(coords: Tensor) -> tuple[Tensor, Tensor]:
         coords: positions in pixels, any shape, floating point.
 
     Returns:
-        `base` int64, floor of the position, clamped to +-`FAR` (NaN becomes `-FAR`), and `fraction` in [0, 1) in the
-        dtype of `coords`; NaN and infinite positions have the fraction NaN, so whatever is blended with it is NaN.
+        `base`, floor of the position in the dtype of `coords`, clamped to +-`FAR` (NaN becomes `-FAR`) so that a cast to
+        an integer type is safe and exact, and `fraction` in [0, 1); NaN and infinite positions have the fraction NaN,
+        so whatever is blended with it is NaN.
     """
     floor = coords.floor()
-    # casting NaN or what exceeds int64 is undefined, hence the clamp comes before the cast
-    base = floor.nan_to_num(nan=-FAR, posinf=FAR, neginf=-FAR).clamp(-FAR, FAR).long()
-    return base, coords - floor
+    return floor.nan_to_num(nan=-FAR, posinf=FAR, neginf=-FAR).clamp_(-FAR, FAR), coords - floor
 
 
 def window_rows(

@@ -36,12 +36,17 @@ class TrainingClips:
             InputError: the four tensors do not fit together or hold values that are not finite.
         """
         clips, frames, _, height, width = self.voxels.shape
-        for name, expected in (("world_T_cam", (clips, frames, 7)), ("inv_depths", (clips, frames, height, width)),
-                               ("intrinsics", (clips, frames, 4))):
+        for name, expected in (
+            ("world_T_cam", (clips, frames, 7)),
+            ("inv_depths", (clips, frames, height, width)),
+            ("intrinsics", (clips, frames, 4)),
+        ):
             found = tuple(getattr(self, name).shape)
             if found != expected:
-                raise InputError(f"training clips: {name} has shape {found}, expected {expected} beside voxels "
-                                 f"{tuple(self.voxels.shape)}")
+                raise InputError(
+                    f"training clips: {name} has shape {found}, expected {expected} beside voxels "
+                    f"{tuple(self.voxels.shape)}"
+                )
         for name, value in vars(self).items():
             if not bool(torch.isfinite(value).all()):
                 raise InputError(f"training clips: {name} holds values that are not finite; the sample is corrupt")

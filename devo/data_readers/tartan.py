@@ -50,9 +50,13 @@ def _induced_flow(relative: Tensor, disparity: Tensor, intrinsics: Tensor) -> tu
     """Flow magnitude and validity (K,h,w) of coarse grids under relative poses (K,4,4); disparity (K,h,w)."""
     rows, columns = disparity.shape[-2:]
     fx, fy, cx, cy = intrinsics
-    y, x = torch.meshgrid(torch.arange(rows, dtype=torch.float32), torch.arange(columns, dtype=torch.float32), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(rows, dtype=torch.float32), torch.arange(columns, dtype=torch.float32), indexing="ij"
+    )
     rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
-    moved = torch.einsum("kij,hwj->khwi", relative[:, :3, :3], rays) + relative[:, None, None, :3, 3] * disparity[..., None]
+    moved = (
+        torch.einsum("kij,hwj->khwi", relative[:, :3, :3], rays) + relative[:, None, None, :3, 3] * disparity[..., None]
+    )
     z = moved[..., 2]
     near = torch.where(z < 0.1, torch.ones_like(z), z)
     flow = torch.stack([fx * moved[..., 0] / near + cx - x, fy * moved[..., 1] / near + cy - y], dim=-1)
@@ -99,8 +103,13 @@ def frame_graph(world_T_cam: np.ndarray, disparity: np.ndarray) -> list[tuple[np
     return graph
 
 
-def walk(graph: list[tuple[np.ndarray, np.ndarray]], start: int, frames: int, rng: np.random.Generator,
-         flow_range: tuple[float, float] = (10.0, 75.0)) -> list[int]:
+def walk(
+    graph: list[tuple[np.ndarray, np.ndarray]],
+    start: int,
+    frames: int,
+    rng: np.random.Generator,
+    flow_range: tuple[float, float] = (10.0, 75.0),
+) -> list[int]:
     """Frame numbers of one clip: each step goes to a random later neighbour whose flow lies inside `flow_range` pixels."""
     chosen = [start]
     while len(chosen) < frames:

@@ -22,7 +22,16 @@ Fixture = Callable[[str], dict[str, np.ndarray]]
 
 def step(world: World, poses: Tensor, patches: Tensor, ep: float = 10.0, **options) -> tuple[SE3, Tensor]:
     return BA(
-        SE3(poses), patches, world.intrinsics, world.target, world.weight, 1e-4, *world.edges, world.bounds, ep, **options
+        SE3(poses),
+        patches,
+        world.intrinsics,
+        world.target,
+        world.weight,
+        1e-4,
+        *world.edges,
+        world.bounds,
+        ep,
+        **options,
     )
 
 
@@ -129,7 +138,9 @@ def test_gradients(structure_only: bool, outliers: bool) -> None:
     tangent = 0.02 * torch.randn(1, 3, 6, dtype=torch.float64, generator=generator)
     good = torch.isfinite(target)
 
-    def outcome(tangent: Tensor, depth: Tensor, intrinsics: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    def outcome(
+        tangent: Tensor, depth: Tensor, intrinsics: Tensor, target: Tensor, weight: Tensor
+    ) -> tuple[Tensor, Tensor]:
         moved = torch.cat((patches[:, :, :2], depth[:, :, None, None, None].expand(1, 6, 1, 3, 3)), 2)
         target = torch.where(good, target, torch.nan)
         poses, new = BA(
@@ -221,7 +232,7 @@ def test_clips_equal_separate_calls(dtype: torch.dtype, fixedp: int) -> None:
         torch.testing.assert_close(joined.data[:, frames], alone.data, rtol=0, atol=tolerance)
         torch.testing.assert_close(joined_patches[:, rows], alone_patches, rtol=0, atol=tolerance)
         grad = joined_grad[:, first : first + len(single.kk)]
-        torch.testing.assert_close(grad, single.target.grad, rtol=0, atol=tolerance * 10)
+        assert (grad - single.target.grad).abs().max() <= 10 * tolerance * grad.abs().max()
         first += len(single.kk)
 
 
@@ -270,7 +281,7 @@ def test_all_depths_are_limited() -> None:
 
 @pytest.mark.parametrize(("axis", "bound", "sign"), [(0, 0, 1), (1, 1, 1), (0, 2, -1), (1, 3, -1)])
 def test_bounds_are_strict(axis: int, bound: int, sign: int) -> None:
-    """A projection on the bound is outside: with a bound on the outermost one, exactly that edge loses its influence."""
+    """With a bound just inside the outermost projection, exactly that edge loses its influence."""
     world = make_world(0)
     pixels = fastba.reproject(world.poses, world.patches, world.intrinsics, *world.edges)[0, :, axis, 1, 1]
     world.target = (world.target + 0.3).requires_grad_()

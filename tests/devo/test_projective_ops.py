@@ -83,12 +83,12 @@ def test_known_motion() -> None:
     with_depth = pops.transform(poses, patches, camera, *edge, depth=True)
     torch.testing.assert_close(with_depth[..., 2].flatten(), torch.tensor([4 / 3]))  # 1 / Z, where Z was 1 before
     cloud = pops.point_cloud(poses, patches, camera, torch.tensor([1]))
-    torch.testing.assert_close(
-        (cloud[..., :3] / cloud[..., 3:]).flatten(), torch.tensor([4 * 0.12, 4 * 0.12, 4 + 1.0])
-    )
+    torch.testing.assert_close((cloud[..., :3] / cloud[..., 3:]).flatten(), torch.tensor([4 * 0.12, 4 * 0.12, 4 + 1.0]))
 
 
-@pytest.mark.parametrize(("inv_depth", "depth", "is_valid"), [(0.5, 0.5, 1), (0.81, 0.19, 0), (0.95, 0.1, 0), (3, 0.1, 0)])
+@pytest.mark.parametrize(
+    ("inv_depth", "depth", "is_valid"), [(0.5, 0.5, 1), (0.81, 0.19, 0), (0.95, 0.1, 0), (3, 0.1, 0)]
+)
 def test_depth_limits(inv_depth: float, depth: float, is_valid: int) -> None:
     poses = torch.tensor([[[0.0, 0, 0, 0, 0, 0, 1], [0.0, 0, -1, 0, 0, 0, 1]]], dtype=torch.float64)
     camera = torch.tensor([[[100.0, 50, 40, 30]] * 2], dtype=torch.float64)
@@ -109,7 +109,6 @@ def test_flow_of_pure_rotation_and_translation() -> None:
     turned = torch.zeros(1, frames, 6, dtype=torch.float64)
     turned[0, :, 4] = torch.arange(frames) * 0.02
     rotation = SE3.exp(turned)
-    moved = pops.transform(rotation, *arguments(world)) - planes(world.patches[:, world.kk, :2]).transpose(2, 4)
     full = pops.flow_mag(rotation, *arguments(world), beta=1.0)
     start = world.patches[:, world.kk, :2].permute(0, 1, 3, 4, 2)
     moved = pops.transform(rotation, *arguments(world)) - start
@@ -157,7 +156,7 @@ def test_jacobians_equal_finite_differences(jitter: float) -> None:
     step = 1e-6
 
     def pixels(frames: Tensor | None, tangent: int, sign: float) -> Tensor:
-        """All edges, with the pose of one end of each edge moved: one pose buffer with moved poses behind the others."""
+        """All edges with the pose of one end moved: one pose buffer, the moved poses behind the others."""
         noise = torch.zeros(1, 5, 6, dtype=torch.float64)
         noise[..., tangent] = sign * step
         buffer = torch.cat((world.poses, SE3(world.poses).retr(noise).data), 1)

@@ -42,16 +42,33 @@ class FixedPatches(nn.Module):
         coords = torch.stack([x, y], -1).expand(frames, -1, -1).contiguous()
         grid = torch.stack(torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")[::-1]).float()
         grid = torch.cat([grid.expand(frames, -1, -1, -1), disps.reshape(frames, 1, height, width)], 1)
-        return (fmap[None], patchify(fmap, coords, 1).flatten(0, 1)[None], torch.zeros(1, frames * patches_per_image, 4, 1, 1),
-                patchify(grid, coords, 1).flatten(0, 1)[None], None, None)
+        return (
+            fmap[None],
+            patchify(fmap, coords, 1).flatten(0, 1)[None],
+            torch.zeros(1, frames * patches_per_image, 4, 1, 1),
+            patchify(grid, coords, 1).flatten(0, 1)[None],
+            None,
+            None,
+        )
 
-    def update(self, net: Tensor, inp: Tensor, corr: Tensor, flow: None, ii: Tensor, jj: Tensor, kk: Tensor,
-               groups: object = None) -> tuple[Tensor, tuple[Tensor, Tensor, None]]:
+    def update(
+        self,
+        net: Tensor,
+        inp: Tensor,
+        corr: Tensor,
+        flow: None,
+        ii: Tensor,
+        jj: Tensor,
+        kk: Tensor,
+        groups: object = None,
+    ) -> tuple[Tensor, tuple[Tensor, Tensor, None]]:
         out = self.head(corr)
         return net + 1, (out[..., :2], torch.sigmoid(out[..., 2:]), None)
 
 
-def random_clips(clips: int, frames: int, seed: int, height: int = 64, width: int = 80) -> tuple[Tensor, SE3, Tensor, Tensor]:
+def random_clips(
+    clips: int, frames: int, seed: int, height: int = 64, width: int = 80
+) -> tuple[Tensor, SE3, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(seed)
     images = torch.randn(clips, frames, 5, height, width, generator=generator)
     poses = SE3.exp(0.03 * torch.randn(clips, frames, 6, generator=generator))
@@ -115,7 +132,9 @@ def test_visibility_excludes_points_outside_the_image_and_behind_others() -> Non
     images, _, disps, intrinsics = random_clips(1, 2, 5)
     disps = torch.ones_like(disps)
     disps[0, 1, :, 40:] = 3.0  # in frame 1 something near covers the right half
-    sideways = torch.tensor([[[0, 0, 0, 0, 0, 0, 1.0], [0.4, 0, 0, 0, 0, 0, 1.0]]])  # 28 px = 7 feature pixels to the right
+    sideways = torch.tensor(
+        [[[0, 0, 0, 0, 0, 0, 1.0], [0.4, 0, 0, 0, 0, 0, 1.0]]]
+    )  # 28 px = 7 feature pixels to the right
     settings = UnrollSettings(steps=1, patches_per_image=40, initial_frames=2)
     torch.manual_seed(0)
     step = unroll_clips(FixedPatches(), images, SE3(sideways), disps, intrinsics, settings).steps[0]  # type: ignore[arg-type]
@@ -137,8 +156,15 @@ def test_joined_clips_give_what_each_clip_gives_alone(fraction: float | None) ->
     torch.manual_seed(1)
     both = unroll_clips(network, images, poses, disps, intrinsics, settings, start).steps  # type: ignore[arg-type]
     torch.manual_seed(1)  # initial depths are drawn clip by clip: the first clip gets the same ones
-    alone = unroll_clips(network, images[:1], SE3(poses.data[:1]), disps[:1], intrinsics[:1], settings,  # type: ignore[arg-type]
-                         None if start is None else start[:1]).steps
+    alone = unroll_clips(
+        network,
+        images[:1],
+        SE3(poses.data[:1]),
+        disps[:1],
+        intrinsics[:1],
+        settings,  # type: ignore[arg-type]
+        None if start is None else start[:1],
+    ).steps
     for joined, single in zip(both, alone):
         half = single.predicted.shape[1]
         torch.testing.assert_close(joined.predicted[:, :half], single.predicted, rtol=0, atol=JOINED_CLIPS)
@@ -177,7 +203,9 @@ def test_volume_equals_direct_correlation_with_gradients() -> None:
     second = volume(kk, jj, coords + 1.3)  # two lookups share one gradient buffer
     gradients = torch.autograd.grad(((ours + second) * weight).sum(), (fmap, gmap))
     shifted = [corr(gmap, maps, (coords + 1.3) / scale, kk, jj, 3) for maps, scale in ((fmap, 1), (pooled, 4))]
-    expected = torch.autograd.grad(((direct + torch.stack(shifted, -1).reshape(1, len(kk), 882)) * weight).sum(), (fmap, gmap))
+    expected = torch.autograd.grad(
+        ((direct + torch.stack(shifted, -1).reshape(1, len(kk), 882)) * weight).sum(), (fmap, gmap)
+    )
     for ours_part, expected_part in zip(gradients, expected):
         torch.testing.assert_close(ours_part, expected_part, rtol=1e-5, atol=CORRELATION_VOLUME)
 
@@ -203,7 +231,11 @@ def test_every_parameter_gets_a_finite_gradient() -> None:
     for step in result.steps:
         assert step.coords is not None
         assert step.poses is not None
-        loss = loss + flow_loss(step.coords, step.coords_gt, step.valid) + pose_loss(step.poses.data, result.poses_gt.data)[0]
+        loss = (
+            loss
+            + flow_loss(step.coords, step.coords_gt, step.valid)
+            + pose_loss(step.poses.data, result.poses_gt.data)[0]
+        )
         loss = loss + direct_loss(step.predicted, step.predicted_gt, step.predicted_valid)
     assert result.steps[-1].scores is not None
     (loss + result.steps[-1].scores.log().mean()).backward()

@@ -56,13 +56,13 @@ def make_world(
     intrinsics: tuple[float, float, float, float] = (85.0, 80.0, 80.0, 60.0),
     jitter_intrinsics: float = 0.0,
 ) -> World:
-    """A random scene: cameras move by about 0.3 and turn by about 3 degrees, depths lie between 1 and 4."""
+    """A random scene: cameras move by about 0.2 and turn by about 3 degrees, depths lie between 1 and 4."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=torch.float64) * 2 - 1
 
-    tangent = torch.cat((uniform(1, frames, 3) * 0.3, uniform(1, frames, 3) * 0.05), -1)
+    tangent = torch.cat((uniform(1, frames, 3) * 0.2, uniform(1, frames, 3) * 0.05), -1)
     tangent[:, 0] = 0
     poses = SE3.exp(tangent).data
     cameras = torch.tensor(intrinsics, dtype=torch.float64).repeat(1, frames, 1)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
 import sys
 import time
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from scripts.cli import run_cli
+from scripts.export_pointcloud import main
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "scripts" / "export_pointcloud.py"
@@ -18,10 +24,30 @@ CAMERA = ["--image_size", "64", "48", "--intrinsics", "60", "60", "31.5", "23.5"
 TINY = ["--weights", "random:0:16,16,8", "--opts", "PATCHES_PER_FRAME", "8"]
 
 
-def run(*arguments: object, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command as a process of its own, as a user starts it."""
     command = [sys.executable, str(SCRIPT), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=cwd,
-                          env={**os.environ, "OMP_NUM_THREADS": "1", **environment})
+                          env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """The same command inside this process, for the many cases that differ in their input only."""
+
+    def command(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+        words = list(map(str, arguments))
+        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *words])
+        if cwd is not None:
+            monkeypatch.chdir(cwd)
+        capsys.readouterr()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            code = run_cli(main, words)
+        output = capsys.readouterr()
+        return subprocess.CompletedProcess(words, code, output.out, output.err)
+
+    return command
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +57,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     count = 20000
     path = tmp_path_factory.mktemp("recording") / "events.npz"
     x, y = generator.integers(0, 64, count), generator.integers(0, 48, count)
-    np.savez(path, x=x.astype(np.uint16), y=y.astype(np.uint16), t=np.sort(generator.integers(0, 200_000, count)), p=generator.integers(0, 2, count).astype(np.uint8))
+    t, p = np.sort(generator.integers(0, 200_000, count)), generator.integers(0, 2, count)
+    np.savez(path, x=x.astype(np.uint16), y=y.astype(np.uint16), t=t, p=p.astype(np.uint8))
     return path
 
 
@@ -89,12 +116,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD, ids=lambda name: name.replace(" ", "-"))
-def test_bad_input_is_one_line_and_exit_code_2(case: str, recording: Path, tmp_path: Path) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(case: str, call: Callable, recording: Path, tmp_path: Path) -> None:
     arguments, words = BAD[case]
     filled = [argument.format(tmp=tmp_path, recording=recording) for argument in arguments]
     extra = [] if "--dataset" in filled else ["--dataset", "generic"]
     out = [] if "--out" in filled else ["--out", tmp_path / "cloud.npy"]
-    one_line_error(run(*extra, *filled, *out, cwd=tmp_path), 2, *words)
+    one_line_error(call(*extra, *filled, *out, cwd=tmp_path), 2, *words)
     assert not list(tmp_path.glob("cloud*"))
 
 
@@ -122,17 +149,17 @@ def corrupt(kind: str, path: Path, recording: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["empty", "garbage", "truncated", "unsorted", "negative", "wrapping"])
-def test_broken_event_files_are_named(kind: str, recording: Path, tmp_path: Path) -> None:
+def test_broken_event_files_are_named(kind: str, call: Callable, recording: Path, tmp_path: Path) -> None:
     path = tmp_path / "broken.npz"
     corrupt(kind, path, recording)
-    done = run("--dataset", "generic", "--datapath", path, *CAMERA, *TINY, "--out", tmp_path / "cloud.npy")
+    done = call("--dataset", "generic", "--datapath", path, *CAMERA, *TINY, "--out", tmp_path / "cloud.npy")
     one_line_error(done, 2, "broken.npz")
 
 
-def test_one_event_is_no_motion(recording: Path, tmp_path: Path) -> None:
+def test_one_event_is_no_motion(call: Callable, recording: Path, tmp_path: Path) -> None:
     path = tmp_path / "single.npz"
     corrupt("one event", path, recording)
-    done = run("--dataset", "generic", "--datapath", path, *CAMERA, *TINY, "--out", tmp_path / "cloud.npy")
+    done = call("--dataset", "generic", "--datapath", path, *CAMERA, *TINY, "--out", tmp_path / "cloud.npy")
     assert done.returncode in (1, 2) and "Traceback" not in done.stderr
 
 
@@ -154,3 +181,23 @@ def test_real_calibrated_recording_runs_through(shared_data: Path, tmp_path: Pat
     assert "untrained" in done.stderr and "Traceback" not in done.stderr
     meta = json.loads((tmp_path / "cloud_meta.json").read_text())
     assert (meta["W"], meta["H"]) == (240, 180) and meta["num_poses"] == 5
+
+
+def test_wrong_arguments_as_a_user_meets_them(recording: Path, tmp_path: Path) -> None:
+    one_line_error(run("--datapath", recording, "--no_such_flag", cwd=tmp_path), 2, "--no_such_flag")
+    one_line_error(run("--dataset", "generic", "--datapath", tmp_path / "none", cwd=tmp_path), 2, "none")
+
+
+def test_a_full_disk_leaves_nothing_half_written(call: Callable, recording: Path, tmp_path: Path,
+                                                 monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk fills up while the poses are written: one line, exit 1, no torn file."""
+    import utils.map_recorder as recorder
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(recorder.np, "save", full)
+    done = call("--dataset", "generic", "--datapath", recording, *CAMERA, *TINY, "--window-ms", 20,
+                "--out", tmp_path / "cloud.npy")
+    one_line_error(done, 1, "cloud_poses.npy", "No space left")
+    assert not [path for path in tmp_path.iterdir() if path.name != "cloud_meta.json"]

@@ -58,6 +58,17 @@ def test_sor_follows_the_rule(backend: str, count: int, copies: int) -> None:
     assert report.parameters == {"neighbors": 20, "std_ratio": 2.0, "backend": backend}
 
 
+@pytest.mark.parametrize("backend", ["scipy", "open3d"])
+def test_sor_divides_by_one_less_than_the_number_of_points(backend: str) -> None:
+    if backend == "open3d":
+        pytest.importorskip("open3d", exc_type=ImportError)
+    points = np.random.default_rng(9).normal(size=(30, 3)).astype(np.float32)
+    means = np.sort(_distances(points), axis=1)[:, :20].mean(axis=1)
+    edge = (means.max() - means.mean()) / means.std(ddof=1)  # the ratio at which the farthest point goes
+    for ratio, kept in ((edge * (1 - 1e-6), 29), (edge * (1 + 1e-6), 30)):
+        assert statistical_outlier(PointCloud(points), std_ratio=ratio, backend=backend)[1].after == kept
+
+
 def test_sor_drops_the_one_far_point() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(5)] * 3), -1).reshape(-1, 3)
     keep, _ = statistical_outlier(PointCloud(np.vstack([grid, [[30, 30, 30]]])))

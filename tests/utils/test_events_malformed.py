@@ -180,7 +180,8 @@ def test_python_objects_are_never_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("array", [np.zeros((5, 3)), np.zeros(5), np.zeros((2, 4, 2)),
-                                   np.zeros(3, dtype=[("x", "u2"), ("y", "u2"), ("t", "i8")])])
+                                   np.zeros(3, dtype=[("x", "u2"), ("y", "u2"), ("t", "i8")]),
+                                   np.zeros(3, dtype=[("x", "u2", 2), ("y", "u2"), ("t", "i8"), ("p", "u1")])])
 def test_npy_of_another_form(array: np.ndarray, tmp_path: Path) -> None:
     np.save(tmp_path / "e.npy", array)
     with pytest.raises(InputError, match="expected"):

@@ -159,13 +159,11 @@ def test_a_guessed_unit_that_cannot_be_is_refused(tmp_path: Path) -> None:
         assert reader.time_range_us() == (0, 149_900)
 
 
-@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("kind", [kind for kind in WRITERS if kind != "hdf5 dsec"])  # that writer refuses them
 def test_unsorted_events_can_be_sorted(kind: str, tmp_path: Path) -> None:
     events = random_events(500, seed=5)
     order = np.random.default_rng(6).permutation(500)
     shuffled = Events(events.x[order], events.y[order], events.t_us[order], events.p[order])
-    if kind == "hdf5 dsec":
-        pytest.skip("our writer refuses unsorted events; the flat file covers reading them")
     path = write_as(kind, tmp_path, shuffled)
     with pytest.raises(InputError, match=r"event \d+.*not sorted"), open_events(path) as reader:
         reader.read(0, 2**60)
@@ -197,7 +195,12 @@ def test_text_reader_goes_back_without_starting_over(tmp_path: Path, monkeypatch
         len(reader)  # builds the index
         decoded: list[int] = []
         decode = reader._decode
-        monkeypatch.setattr(reader, "_decode", lambda block: (decoded.append(block), decode(block))[1])
+
+        def spy(block: int) -> Events | None:
+            decoded.append(block)
+            return decode(block)
+
+        monkeypatch.setattr(reader, "_decode", spy)
         middle = int(events.t_us[2500])
         assert same(reader.read(middle, middle + 100), events.between(middle, middle + 100))
         assert len(decoded) <= 3

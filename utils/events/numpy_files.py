@@ -173,12 +173,13 @@ class NpyEventReader(RowReader):
         super().__init__(path, sensor_size, order)
         with _damage_is_input_error(path, "npy"):
             self._array: Any = np.load(path, mmap_mode="r", allow_pickle=False)
-        if self._array.dtype.names is not None and self._array.ndim == 1:
-            self._fields = find_columns(list(self._array.dtype.names), path)
-        elif self._array.dtype.names is None and self._array.ndim == 2 and self._array.shape[1] == 4:
+        dtype = self._array.dtype
+        if dtype.names is not None and self._array.ndim == 1 and all(dtype[name].shape == () for name in dtype.names):
+            self._fields = find_columns(list(dtype.names), path)
+        elif dtype.names is None and self._array.ndim == 2 and self._array.shape[1] == 4:
             self._fields = {}
         else:
-            raise InputError(f"{path}: array of dtype {self._array.dtype} and shape {self._array.shape}, expected "
+            raise InputError(f"{path}: array of dtype {dtype} and shape {self._array.shape}, expected "
                              "records with the fields x, y, t, p or a table (N, 4) with the columns t x y p")
         self.rows = len(self._array)
         self._unit = time_unit or guess_time_unit(self._column("t", 0, min(self.rows, _ROWS_PER_BLOCK)))

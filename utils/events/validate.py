@@ -109,11 +109,10 @@ def to_microseconds(stamps: Column, unit: TimeUnit, where: Locator) -> npt.NDArr
         bad = ~np.isfinite(values)
         if bad.any():
             raise InputError(f"{where(_first(bad))}: time stamp is {values[_first(bad)]}, expected a finite number")
-        values = values / 1000.0 if unit == "ns" else values * _MICROSECONDS_PER[unit]
-        bad = np.abs(values) >= 2.0**62
+        bad = np.abs(values) >= 2.0**62 / _MICROSECONDS_PER.get(unit, 1)
         if bad.any():
             raise InputError(f"{where(_first(bad))}: time stamp {stamps[_first(bad)]} {unit} is out of any range")
-        return np.rint(values).astype(np.int64)
+        return np.rint(values / 1000.0 if unit == "ns" else values * _MICROSECONDS_PER[unit]).astype(np.int64)
     if stamps.dtype.kind not in "iub":
         raise InputError(f"{where(0)}: time stamps have dtype {stamps.dtype}, expected numbers")
     limit = 2**62 // _MICROSECONDS_PER.get(unit, 1)

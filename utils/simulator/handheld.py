@@ -108,8 +108,9 @@ class HandheldPath:
         return np.array(knots), np.interp(wanted, travelled, np.arange(len(travelled)) / per_knot)
 
     def _effort(self, poses: torch.Tensor) -> np.ndarray:
-        """Mean image motion in pixels between successive poses, but at least a third of what turning and moving would each
-        cause alone: where the two cancel, a hand does not become arbitrarily fast."""
+        """Mean image motion in pixels between successive poses, but at least a third of what turning plus moving could
+        cause: where the two cancel, a hand does not become arbitrarily fast.
+        """
         flow = self._flow(poses[:-1], poses[1:]).mean((1, 2))
         moved = (poses[1:, :3] - poses[:-1, :3]).norm(dim=-1)
         between = compose(invert(poses[:-1]), poses[1:])

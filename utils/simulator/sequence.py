@@ -97,7 +97,7 @@ class SimulatedSequence:
         path_rng = np.random.default_rng([settings.seed, 2])
         self.path = HandheldPath(self.world, rays, float(self.duration_us), PRESETS[settings.preset], path_rng)
         self._device = torch.device(device)
-        self._renderer = Renderer(self.world.planes.to(device), build_atlas(self.world.tiles.to(device)),
+        self._renderer = Renderer(self.world.planes.to(device), build_atlas(self.world.draw_tiles().to(device)),
                                   camera_rays(self.camera, device), self.world.empty)
 
     def log_intensity(self, t_us: np.ndarray) -> torch.Tensor:

@@ -19,6 +19,7 @@ from utils.simulator.textures import SYMBOLS, draw_symbol, log_reflectance, rand
 
 BOARD_TILE = 2048
 SURFACE_TILE = 512
+UNIQUE_SURFACES = 16
 EMPTY_GREY = 0.35
 WayPoints = Callable[[np.random.Generator], Iterator[np.ndarray]]
 """Draws endless way points `(6,)`: position in metres, then yaw (right), pitch (up) and roll in radians."""
@@ -32,7 +33,7 @@ class World:
         kind: `board`, `room`, `planes` or `corridor`.
         planes: one scene, metres.
         names: what each of the P pieces is.
-        tiles: `(P, T, T)` float32 log reflectance.
+        draw_tiles: paints the textures, `(P, T, T)` float32 log reflectance; the same each time.
         way_points: where a hand could carry the camera.
         empty: log intensity where nothing is hit.
     """
@@ -40,7 +41,7 @@ class World:
     kind: str
     planes: Planes
     names: list[str]
-    tiles: torch.Tensor
+    draw_tiles: Callable[[], torch.Tensor]
     way_points: WayPoints
     empty: float = float(np.log(EMPTY_GREY))
 
@@ -56,28 +57,39 @@ def build_world(kind: str, focal: float, seed: int, background: bool = False) ->
     """
     rng = np.random.default_rng([seed, list(WORLDS).index(kind)])
     if kind == "board":
-        return _board_world(focal, rng, background)
+        return _board_world(focal, seed, rng, background)
     collected = PlaneList(focal, SURFACE_TILE, rng, sharpness=(0.2, 0.5))
     way_points = WORLDS[kind](collected)
-    tiles = [_surface(rng, SURFACE_TILE) for _ in collected.names]
-    return World(kind, collected.planes(), collected.names, torch.from_numpy(np.stack(tiles)), way_points)
+    tile_seed = [seed, list(WORLDS).index(kind), 1]
+    return World(kind, collected.planes(), collected.names,
+                 lambda: _surfaces(len(collected.names), tile_seed), way_points)
 
 
-def _surface(rng: np.random.Generator, size: int) -> np.ndarray:
-    return log_reflectance(random_texture(size, rng)) * rng.uniform(0.5, 1.0) + rng.normal(0, 0.2)
+def _surfaces(count: int, seed: list[int]) -> torch.Tensor:
+    """Tiles `(count, T, T)` of at most `UNIQUE_SURFACES` patterns, each piece with its own contrast and brightness."""
+    rng = np.random.default_rng(seed)
+    patterns = [log_reflectance(random_texture(SURFACE_TILE, rng)) for _ in range(min(count, UNIQUE_SURFACES))]
+    picks = np.concatenate([rng.permutation(len(patterns)) for _ in range(-(-count // len(patterns)))])[:count]
+    tiles = [patterns[pick] * rng.uniform(0.5, 1.0) + rng.normal(0, 0.2) for pick in picks]
+    return torch.from_numpy(np.stack(tiles).astype(np.float32))
 
 
-def _board_world(focal: float, rng: np.random.Generator, background: bool) -> World:
+def _board_world(focal: float, seed: int, rng: np.random.Generator, background: bool) -> World:
     collected = PlaneList(focal, BOARD_TILE, rng, sharpness=(0.05, 0.12))
     distance, half_width, half_height = 0.9, 0.8, 0.6
     collected.add(np.array([0, 0, distance]), tilted(rng, 12), half_width, half_height, spin=_upright(rng),
                   whole_tile=True, name="board")
-    tiles = [log_reflectance(printed_board(BOARD_TILE, half_height / half_width, rng))]
     if background:
         collected.add(np.array([0, 0, distance + rng.uniform(0.7, 1.2)]), tilted(rng, 20), name="background")
-        tiles.append(_surface(rng, BOARD_TILE))
+
+    def draw_tiles() -> torch.Tensor:
+        painter = np.random.default_rng([seed, 1])
+        board = log_reflectance(printed_board(BOARD_TILE, half_height / half_width, painter))
+        wall = [log_reflectance(random_texture(BOARD_TILE, painter))] if background else []
+        return torch.from_numpy(np.stack([board, *wall]))
+
     way_points = _wander((0.30, 0.22, 0.22), (0, 0, distance), (0.3, 0.2, 0.0))
-    return World("board", collected.planes(), collected.names, torch.from_numpy(np.stack(tiles)), way_points)
+    return World("board", collected.planes(), collected.names, draw_tiles, way_points)
 
 
 def _upright(rng: np.random.Generator) -> float:

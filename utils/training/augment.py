@@ -68,7 +68,9 @@ def random_crop(clips: TrainingClips, height: int, width: int, generator: torch.
     left = int(torch.randint(0, columns - width + 1, (), generator=generator))
     window = (..., slice(top, top + height), slice(left, left + width))
     shift = torch.tensor([0.0, 0.0, -left, -top])
-    return replace(clips, voxels=clips.voxels[window], inv_depths=clips.inv_depths[window], intrinsics=clips.intrinsics + shift)
+    return replace(
+        clips, voxels=clips.voxels[window], inv_depths=clips.inv_depths[window], intrinsics=clips.intrinsics + shift
+    )
 
 
 def zoom(clips: TrainingClips, factor: float) -> TrainingClips:
@@ -80,8 +82,12 @@ def zoom(clips: TrainingClips, factor: float) -> TrainingClips:
     scale = torch.tensor([width / old_width, height / old_height] * 2)
     intrinsics = clips.intrinsics * scale
     intrinsics[..., 2:] += 0.5 * scale[2:] - 0.5  # integer coordinates are pixel centres
-    return replace(clips, voxels=voxels.view(*clips.voxels.shape[:3], height, width),
-                   inv_depths=depths.view(*clips.inv_depths.shape[:2], height, width), intrinsics=intrinsics)
+    return replace(
+        clips,
+        voxels=voxels.view(*clips.voxels.shape[:3], height, width),
+        inv_depths=depths.view(*clips.inv_depths.shape[:2], height, width),
+        intrinsics=intrinsics,
+    )
 
 
 def reflect(clips: TrainingClips, axis: int) -> TrainingClips:
@@ -94,7 +100,9 @@ def reflect(clips: TrainingClips, axis: int) -> TrainingClips:
     flip = torch.tensor([[-1.0, 1, 1, 1, -1, -1, 1], [1.0, -1, 1, -1, 1, -1, 1]][axis])
     intrinsics = clips.intrinsics.clone()
     intrinsics[..., 2 + axis] = side - 1 - intrinsics[..., 2 + axis]
-    return TrainingClips(clips.voxels.flip(-1 - axis), clips.world_T_cam * flip, clips.inv_depths.flip(-1 - axis), intrinsics)
+    return TrainingClips(
+        clips.voxels.flip(-1 - axis), clips.world_T_cam * flip, clips.inv_depths.flip(-1 - axis), intrinsics
+    )
 
 
 def reverse_time(clips: TrainingClips) -> TrainingClips:
@@ -123,8 +131,9 @@ def disturb(voxels: Tensor, settings: AugmentSettings, generator: torch.Generato
     return voxels
 
 
-def augment(clips: TrainingClips, frames: int, size: tuple[int, int], settings: AugmentSettings,
-            generator: torch.Generator) -> TrainingClips:
+def augment(
+    clips: TrainingClips, frames: int, size: tuple[int, int], settings: AugmentSettings, generator: torch.Generator
+) -> TrainingClips:
     """Draw `frames` frames and a window of `size` (height, width) from `clips` and disturb them."""
     clips = clips.frames(choose_frames(clips.voxels.shape[1], frames, settings.skip_frames, generator)).to("cpu")
     if float(torch.rand((), generator=generator)) < settings.zoom:

@@ -79,11 +79,16 @@ def settings_from_options(options: argparse.Namespace) -> TrainSettings:
     if options.shard_size:
         changes["shard_size"] = _size(options.shard_size)
     settings = TrainSettings.from_preset(options.preset, **changes)
-    settings = replace(settings, loss=_changed(settings.loss, options.loss, "--loss"),
-                       augment=_changed(settings.augment, options.augment, "--augment"))
+    settings = replace(
+        settings,
+        loss=_changed(settings.loss, options.loss, "--loss"),
+        augment=_changed(settings.augment, options.augment, "--augment"),
+    )
     height, width = settings.shard_size
     if any(h > height or w > width for h, w in settings.sizes):
-        raise InputError(f"--size {settings.sizes} does not fit into the simulated {height}x{width}; raise --shard-size")
+        raise InputError(
+            f"--size {settings.sizes} does not fit into the simulated {height}x{width}; raise --shard-size"
+        )
     if settings.frames > settings.shard_frames:
         raise InputError(f"--frames {settings.frames} exceeds --shard-frames {settings.shard_frames}")
     return settings
@@ -113,15 +118,21 @@ def _changed(settings: Any, assignments: list[str], flag: str) -> Any:
     return replace(settings, **changes)
 
 
-def _data(options: argparse.Namespace, settings: TrainSettings, start: int, rank: int) -> tuple[ClipSource, TrainingClips | None]:
+def _data(
+    options: argparse.Namespace, settings: TrainSettings, start: int, rank: int
+) -> tuple[ClipSource, TrainingClips | None]:
     if options.data != "sim":
         from utils.training.tartan_source import tartan_source
 
         return tartan_source(settings), None
     cache = Path(options.cache) if options.cache else Path(options.runs) / "cache"
     producer = "elsewhere" if rank else "inline" if options.no_background else "background"
-    source = simulated_source(settings, cache, producer=producer, start_step=start * int(os.environ.get("WORLD_SIZE", "1")))
-    validation = validation_clips(settings, cache, options.validation_clips) if rank == 0 and options.validation_clips else None
+    source = simulated_source(
+        settings, cache, producer=producer, start_step=start * int(os.environ.get("WORLD_SIZE", "1"))
+    )
+    validation = (
+        validation_clips(settings, cache, options.validation_clips) if rank == 0 and options.validation_clips else None
+    )
     return source, validation
 
 
@@ -161,8 +172,13 @@ def _reporter(rank: int) -> Any:
 
 def _write_description(folder: Path, settings: TrainSettings, options: argparse.Namespace) -> None:
     """`run.json`: command line, settings, versions."""
-    description = {"command": sys.argv, "settings": settings.as_dict(), "torch": torch.__version__,
-                   "python": platform.python_version(), "machine": platform.processor() or platform.machine(),
-                   "options": {name: value for name, value in vars(options).items() if value is not None}}
+    description = {
+        "command": sys.argv,
+        "settings": settings.as_dict(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "machine": platform.processor() or platform.machine(),
+        "options": {name: value for name, value in vars(options).items() if value is not None},
+    }
     with atomic_path(folder / "run.json") as temporary:
         temporary.write_text(json.dumps(description, indent=2) + "\n")

@@ -8,8 +8,14 @@ from pathlib import Path
 
 from utils.atomic import atomic_path
 
-PANELS = (("total", "direct", "direct_first", "probe"), ("flow", "flow_last"), ("pose",), ("scores",),
-          ("val_flow", "val_first", "val_probe", "val_last"), ("val_ate", "val_lost"))
+PANELS = (
+    ("total", "direct", "direct_first", "probe"),
+    ("flow", "flow_last"),
+    ("pose",),
+    ("scores",),
+    ("val_flow", "val_first", "val_probe", "val_last"),
+    ("val_ate", "val_lost"),
+)
 
 
 class TrainingLog:
@@ -27,11 +33,14 @@ class TrainingLog:
         first = self.columns is None
         if self.columns is None:
             self.columns = list(row)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a", newline="") as stream:
             writer = csv.DictWriter(stream, self.columns, restval="", extrasaction="raise")
             if first:
                 writer.writeheader()
-            writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
+            writer.writerow(
+                {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()}
+            )
 
 
 def read_log(path: Path) -> dict[str, list[float]]:
@@ -62,7 +71,8 @@ def draw_curves(training: Path, validation: Path, picture: Path) -> None:
         axes.set_yscale("log")
         axes.set_xlabel("step")
         axes.grid(alpha=0.3, which="both")
-        axes.legend(fontsize=8)
+        if axes.lines:
+            axes.legend(fontsize=8)
     figure.tight_layout()
     with atomic_path(picture) as temporary:
         figure.savefig(temporary, dpi=80)

@@ -44,7 +44,12 @@ def write_shard(path: Path, clips: TrainingClips) -> None:
     """Store clips as float16 voxels and depths, float32 poses and intrinsics (npz, written atomically)."""
     halves = {"voxels": clips.voxels.clamp(-6e4, 6e4).half().numpy(), "inv_depths": clips.inv_depths.half().numpy()}
     with atomic_path(path) as temporary:
-        np.savez(temporary, **halves, world_T_cam=clips.world_T_cam.float().numpy(), intrinsics=clips.intrinsics.float().numpy())
+        np.savez(
+            temporary,
+            **halves,
+            world_T_cam=clips.world_T_cam.float().numpy(),
+            intrinsics=clips.intrinsics.float().numpy(),
+        )
 
 
 def read_shard(path: Path, settings: ShardSettings) -> TrainingClips:
@@ -57,12 +62,16 @@ def read_shard(path: Path, settings: ShardSettings) -> TrainingClips:
         with np.load(path, allow_pickle=False) as archive:
             clips = TrainingClips(*(torch.from_numpy(archive[name]) for name in FIELDS)).check()
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"cached training sample {path} is corrupt ({error}); delete it, it will be made again") from error
+        raise InputError(
+            f"cached training sample {path} is corrupt ({error}); delete it, it will be made again"
+        ) from error
     expected = (settings.clips, settings.frames, settings.height, settings.width)
     shape = clips.voxels.shape
     if (*shape[:2], *shape[3:]) != expected:
-        raise InputError(f"cached training sample {path} has clips, frames, height, width "
-                         f"{(*shape[:2], *shape[3:])}, expected {expected}; delete it, it will be made again")
+        raise InputError(
+            f"cached training sample {path} has clips, frames, height, width "
+            f"{(*shape[:2], *shape[3:])}, expected {expected}; delete it, it will be made again"
+        )
     return clips
 
 
@@ -78,7 +87,9 @@ def ensure_shard(folder: Path, number: int, settings: ShardSettings, make: Shard
         write_shard(path, make(settings, number))
 
 
-def _produce(folder: Path, settings: ShardSettings, make: ShardMaker, position: Any, ahead: int, keep: int, nice: int) -> None:
+def _produce(
+    folder: Path, settings: ShardSettings, make: ShardMaker, position: Any, ahead: int, keep: int, nice: int
+) -> None:
     """Background process: keep the shards up to `ahead` beyond the trainer's newest one on disk, delete old ones."""
     import os
 
@@ -116,9 +127,23 @@ class ClipPool:
             `elsewhere` (another trainer with the same cache makes them, this one waits).
     """
 
-    def __init__(self, folder: Path, settings: ShardSettings, make: ShardMaker, *, clips: int, frames: int,
-                 sizes: tuple[tuple[int, int], ...], shards: int, reuse: int, augment_settings: AugmentSettings,
-                 first: int = 4, producer: str = "background", start_step: int = 0, nice: int = 0) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        settings: ShardSettings,
+        make: ShardMaker,
+        *,
+        clips: int,
+        frames: int,
+        sizes: tuple[tuple[int, int], ...],
+        shards: int,
+        reuse: int,
+        augment_settings: AugmentSettings,
+        first: int = 4,
+        producer: str = "background",
+        start_step: int = 0,
+        nice: int = 0,
+    ) -> None:
         self.folder, self.settings, self.make = folder, settings, make
         self.clips, self.frames_per_clip, self.sizes, self.shards, self.reuse = clips, frames, sizes, shards, reuse
         self.augment_settings, self.first = augment_settings, first
@@ -133,8 +158,8 @@ class ClipPool:
             context = multiprocessing.get_context("spawn")
             self._position = context.Value("q", self.window(start_step)[1])
             self._process = context.Process(
-                target=_produce, daemon=True,
-                args=(folder, settings, make, self._position, 2, shards + 2, nice))
+                target=_produce, daemon=True, args=(folder, settings, make, self._position, 2, shards + 2, nice)
+            )
             self._process.start()
 
     def _check_writable(self) -> None:
@@ -144,7 +169,9 @@ class ClipPool:
                 temporary.write_bytes(b"devo")
             (self.folder / "probe.tmp").unlink()
         except OutputError as error:
-            raise OutputError(f"cannot write the clip cache {self.folder}: {error}; choose another folder with --cache") from error
+            raise OutputError(
+                f"cannot write the clip cache {self.folder}: {error}; choose another folder with --cache"
+            ) from error
 
     def window(self, step: int) -> tuple[int, int]:
         """Numbers of the oldest and newest shard used at a step."""
@@ -178,8 +205,10 @@ class ClipPool:
         start = time.monotonic()
         while not path.is_file():
             if self._process is not None and not self._process.is_alive():
-                raise DevoError(f"the process that simulates training clips ended (exit code {self._process.exitcode}) before it "
-                                f"wrote {path}; its message is above. Too little memory? Try fewer --shard-clips")
+                raise DevoError(
+                    f"the process that simulates training clips ended (exit code {self._process.exitcode}) before it "
+                    f"wrote {path}; its message is above. Too little memory? Try fewer --shard-clips"
+                )
             time.sleep(POLL_SECONDS)
         self.waited_seconds += time.monotonic() - start
 
@@ -192,7 +221,7 @@ class ClipPool:
         size = self.sizes[int(torch.randint(0, len(self.sizes), (), generator=generator))]
         numbers = torch.randint(oldest, newest + 1, (self.clips,), generator=generator).tolist()
         chosen = torch.randint(0, self.settings.clips, (self.clips,), generator=generator)
-        raw = TrainingClips.join([self.shard(number).clips(chosen[i:i + 1]) for i, number in enumerate(numbers)])
+        raw = TrainingClips.join([self.shard(number).clips(chosen[i : i + 1]) for i, number in enumerate(numbers)])
         return augment(raw, self.frames_per_clip, size, self.augment_settings, generator)
 
     def close(self) -> None:

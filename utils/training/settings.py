@@ -119,8 +119,14 @@ class TrainSettings:
 
     def network_arguments(self) -> dict[str, Any]:
         """Keyword arguments of `eVONet`."""
-        return {"dim_inet": self.dim_inet, "dim_fnet": self.dim_fnet, "dim": self.dim, "norm": self.norm,
-                "randaug": self.randaug, "patch_selector": "scorer"}
+        return {
+            "dim_inet": self.dim_inet,
+            "dim_fnet": self.dim_fnet,
+            "dim": self.dim,
+            "norm": self.norm,
+            "randaug": self.randaug,
+            "patch_selector": "scorer",
+        }
 
 
 def _plain(value: Any) -> Any:

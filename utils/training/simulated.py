@@ -36,17 +36,30 @@ def cache_folder(root: Path, settings: ShardSettings) -> Path:
     return root / f"sim_{hashlib.sha256(key.encode()).hexdigest()[:12]}"
 
 
-def simulated_source(settings: TrainSettings, cache: Path, *, producer: str = "background", start_step: int = 0) -> ClipPool:
+def simulated_source(
+    settings: TrainSettings, cache: Path, *, producer: str = "background", start_step: int = 0
+) -> ClipPool:
     """Pool of simulated clips for a training run, cached below `cache`."""
     shards = shard_settings(settings)
     return ClipPool(
-        cache_folder(cache, shards), shards, simulate_shard, clips=settings.clips, frames=settings.frames, sizes=settings.sizes,
-        shards=settings.pool_shards, reuse=settings.reuse, augment_settings=settings.augment, producer=producer,
-        start_step=start_step, nice=5)
+        cache_folder(cache, shards),
+        shards,
+        simulate_shard,
+        clips=settings.clips,
+        frames=settings.frames,
+        sizes=settings.sizes,
+        shards=settings.pool_shards,
+        reuse=settings.reuse,
+        augment_settings=settings.augment,
+        producer=producer,
+        start_step=start_step,
+        nice=5,
+    )
 
 
-def validation_clips(settings: TrainSettings, cache: Path, count: int = 32, frames: int = 10,
-                     size: tuple[int, int] = (128, 160)) -> TrainingClips:
+def validation_clips(
+    settings: TrainSettings, cache: Path, count: int = 32, frames: int = 10, size: tuple[int, int] = (128, 160)
+) -> TrainingClips:
     """Fixed clips that no training run sees (their seed lies outside the range of training seeds), cached on disk."""
     from utils.training.pool import ensure_shard, read_shard, shard_path
 

@@ -58,17 +58,29 @@ class TrainingStep(nn.Module):
         """The graph schedule of training steps."""
         wanted = self.settings
         return UnrollSettings(
-            steps=wanted.updates, patches_per_image=wanted.patches, structure_only=structure_only,
-            initial_frames=wanted.initial_frames, solver_gradient_every=wanted.solver_gradient_every,
+            steps=wanted.updates,
+            patches_per_image=wanted.patches,
+            structure_only=structure_only,
+            initial_frames=wanted.initial_frames,
+            solver_gradient_every=wanted.solver_gradient_every,
             match_gradient_every=wanted.match_gradient_every,
-            probe=wanted.loss.probe > 0, mixed_precision=PRECISIONS[wanted.precision])
+            probe=wanted.loss.probe > 0,
+            mixed_precision=PRECISIONS[wanted.precision],
+        )
 
     def forward(self, clips: TrainingClips, plan: StepPlan) -> dict[str, Tensor]:
         """Total loss (key `total`) and its parts (without gradient) for a batch on the network's device."""
         images = self.network.normalize(clips.voxels)
         poses = SE3(clips.world_T_cam).inv()
-        result = unroll_clips(self.network, images, poses, clips.inv_depths, clips.intrinsics,
-                              self.unroll_settings(plan.structure_only), plan.start_fraction.to(images.device))
+        result = unroll_clips(
+            self.network,
+            images,
+            poses,
+            clips.inv_depths,
+            clips.intrinsics,
+            self.unroll_settings(plan.structure_only),
+            plan.start_fraction.to(images.device),
+        )
         return total_loss(result, self.settings.loss, plan)
 
 

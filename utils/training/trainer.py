@@ -34,7 +34,19 @@ from utils.training.validate import ValidationSettings, validate
 
 logger = logging.getLogger(__name__)
 
-LOG_NAMES = ("total", "start", "direct", "direct_first", "direct_last", "probe", "flow", "flow_last", "pose", "scores", "confidence")
+LOG_NAMES = (
+    "total",
+    "start",
+    "direct",
+    "direct_first",
+    "direct_last",
+    "probe",
+    "flow",
+    "flow_last",
+    "pose",
+    "scores",
+    "confidence",
+)
 FAILED_IN_A_ROW = 50
 
 
@@ -63,9 +75,17 @@ class Trainer:
         rank, world: of this process; only rank 0 writes files.
     """
 
-    def __init__(self, network: eVONet, settings: TrainSettings, run: RunSettings, source: ClipSource,
-                 validation: TrainingClips | None = None, report: Callable[[str], None] = logger.info,
-                 rank: int = 0, world: int = 1) -> None:
+    def __init__(
+        self,
+        network: eVONet,
+        settings: TrainSettings,
+        run: RunSettings,
+        source: ClipSource,
+        validation: TrainingClips | None = None,
+        report: Callable[[str], None] = logger.info,
+        rank: int = 0,
+        world: int = 1,
+    ) -> None:
         self.network, self.settings, self.run, self.source = network, settings, run, source
         self.validation, self.report, self.rank, self.world = validation, report, rank, world
         self.device = next(network.parameters()).device
@@ -75,10 +95,18 @@ class Trainer:
         if world > 1:
             devices = [self.device.index] if self.device.type == "cuda" else None
             self.module = nn.parallel.DistributedDataParallel(self.module, devices, find_unused_parameters=True)
-        self.optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay,
-                                           betas=(0.9, 0.999), eps=1e-8, fused=self.device.type in ("cpu", "cuda"))
+        self.optimiser = torch.optim.AdamW(
+            network.parameters(),
+            lr=settings.learning_rate,
+            weight_decay=settings.weight_decay,
+            betas=(0.9, 0.999),
+            eps=1e-8,
+            fused=self.device.type in ("cpu", "cuda"),
+        )
         self.average = AveragedWeights(network, settings.ema)
-        self.scaler = torch.amp.GradScaler("cuda", enabled=settings.precision == "float16" and self.device.type == "cuda")
+        self.scaler = torch.amp.GradScaler(
+            "cuda", enabled=settings.precision == "float16" and self.device.type == "cuda"
+        )
         self.step = 0
         self.skipped = 0
         self.best = math.inf
@@ -136,8 +164,10 @@ class Trainer:
             values = self.train_step()
             failed = 0 if values["finite"] else failed + 1
             if failed >= FAILED_IN_A_ROW:
-                raise DevoError(f"{failed} steps in a row gave no finite loss; lower --lr or --clip, the state before is in "
-                                f"{run.folder / 'last.pth'}")
+                raise DevoError(
+                    f"{failed} steps in a row gave no finite loss; lower --lr or --clip, the state before is in "
+                    f"{run.folder / 'last.pth'}"
+                )
             if values["finite"]:
                 for name, value in values.items():
                     sums[name].append(value)
@@ -157,13 +187,26 @@ class Trainer:
         return reason
 
     def _log(self, curves: TrainingLog, sums: dict[str, list[float]], rate: float) -> None:
-        means = {name: (math.fsum(sums[name]) / len(sums[name]) if sums.get(name) else math.nan) for name in (*LOG_NAMES, "norm")}
+        means = {
+            name: (math.fsum(sums[name]) / len(sums[name]) if sums.get(name) else math.nan)
+            for name in (*LOG_NAMES, "norm")
+        }
         waited = float(getattr(self.source, "waited_seconds", 0.0))
-        curves.append({"step": self.step, "lr": learning_rate(self.settings, self.step - 1), **means, "clips_per_s": rate,
-                       "waited_s": waited, "skipped": self.skipped})
+        curves.append(
+            {
+                "step": self.step,
+                "lr": learning_rate(self.settings, self.step - 1),
+                **means,
+                "clips_per_s": rate,
+                "waited_s": waited,
+                "skipped": self.skipped,
+            }
+        )
         shown = " ".join(f"{name} {means[name]:.3f}" for name in LOG_NAMES if not math.isnan(means[name]))
-        self.report(f"step {self.step} {shown} norm {means['norm']:.2f} {rate:.2f} clips/s waited {waited:.0f} s "
-                    f"skipped {self.skipped}")
+        self.report(
+            f"step {self.step} {shown} norm {means['norm']:.2f} {rate:.2f} clips/s waited {waited:.0f} s "
+            f"skipped {self.skipped}"
+        )
 
     def validate_and_keep(self) -> dict[str, float] | None:
         """Validate the averaged weights; write `best.pth` where the figure of merit improved. Rank 0 only."""
@@ -172,14 +215,21 @@ class Trainer:
         current = {name: value.clone() for name, value in self.network.state_dict().items()}
         self.network.load_state_dict(self.average.values)
         try:
-            figures = validate(self.network, self.validation, ValidationSettings(patches=max(24, self.settings.patches)))
+            figures = validate(
+                self.network, self.validation, ValidationSettings(patches=max(24, self.settings.patches))
+            )
             TrainingLog(self.run.folder / "validation.csv").append({"step": self.step, **figures})
             merit = figure_of_merit(figures)
             better = merit < self.best
             if better:
                 self.best = merit
-                save_checkpoint(self.run.folder / "best.pth", self.network, steps=self.step, validation=figures,
-                                settings=self.settings.as_dict())
+                save_checkpoint(
+                    self.run.folder / "best.pth",
+                    self.network,
+                    steps=self.step,
+                    validation=figures,
+                    settings=self.settings.as_dict(),
+                )
         finally:
             self.network.load_state_dict(current)
         shown = " ".join(f"{name} {value:.3f}" for name, value in figures.items())
@@ -194,10 +244,19 @@ class Trainer:
         if self.rank != 0:
             return
         save_checkpoint(
-            path, self.network, steps=self.step, optimizer_state_dict=self.optimiser.state_dict(),
-            scheduler_state_dict={"last_epoch": self.step}, scaler_state_dict=self.scaler.state_dict(),
-            average=self.average.state_dict(), random=random_state(), best=self.best, skipped=self.skipped,
-            seconds=self.trained_seconds + seconds, settings=self.settings.as_dict())
+            path,
+            self.network,
+            steps=self.step,
+            optimizer_state_dict=self.optimiser.state_dict(),
+            scheduler_state_dict={"last_epoch": self.step},
+            scaler_state_dict=self.scaler.state_dict(),
+            average=self.average.state_dict(),
+            random=random_state(),
+            best=self.best,
+            skipped=self.skipped,
+            seconds=self.trained_seconds + seconds,
+            settings=self.settings.as_dict(),
+        )
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint written by `save`.
@@ -208,7 +267,9 @@ class Trainer:
         state = training_state(path)
         missing = {"model_state_dict", "optimizer_state_dict", "average", "random", "steps"} - set(state)
         if missing:
-            raise CheckpointError(f"{path} cannot be resumed, it lacks {sorted(missing)[0]!r}; use --init to start from its weights")
+            raise CheckpointError(
+                f"{path} cannot be resumed, it lacks {sorted(missing)[0]!r}; use --init to start from its weights"
+            )
         check_dimensions(path, state, self.settings)
         self.network.load_state_dict(state["model_state_dict"])
         self.optimiser.load_state_dict(state["optimizer_state_dict"])
@@ -245,10 +306,14 @@ def check_dimensions(path: Path, state: dict[str, Any], settings: TrainSettings)
         CheckpointError: names the first tensor that differs.
     """
     with torch.device("meta"):
-        wanted = {name: tuple(value.shape) for name, value in eVONet(**settings.network_arguments()).state_dict().items()}
+        wanted = {
+            name: tuple(value.shape) for name, value in eVONet(**settings.network_arguments()).state_dict().items()
+        }
     found = {name: tuple(value.shape) for name, value in state["model_state_dict"].items()}
     if found == wanted:
         return
     name = sorted(key for key in set(found) | set(wanted) if found.get(key) != wanted.get(key))[0]
-    raise CheckpointError(f"{path} holds a network of other dimensions: {name} is {found.get(name, 'absent')}, this run "
-                          f"expects {wanted.get(name, 'no such tensor')}; choose the matching --preset")
+    raise CheckpointError(
+        f"{path} holds a network of other dimensions: {name} is {found.get(name, 'absent')}, this run "
+        f"expects {wanted.get(name, 'no such tensor')}; choose the matching --preset"
+    )

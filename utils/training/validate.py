@@ -28,7 +28,9 @@ class ValidationSettings:
 
 
 @torch.no_grad()
-def validate(network: eVONet, clips: TrainingClips, settings: ValidationSettings = ValidationSettings()) -> dict[str, float]:  # noqa: B008
+def validate(
+    network: eVONet, clips: TrainingClips, settings: ValidationSettings = ValidationSettings()
+) -> dict[str, float]:  # noqa: B008
     """Evaluate; the random state outside is left as it was.
 
     Returns:
@@ -52,7 +54,9 @@ def validate(network: eVONet, clips: TrainingClips, settings: ValidationSettings
         finally:
             network.train(was_training)
     joined = {name: torch.cat(values) for name, values in gathered.items()}
-    result = {name: float(joined[name].median()) for name in ("flow", "start", "first", "last", "probe", "rotation", "ate")}
+    result = {
+        name: float(joined[name].median()) for name in ("flow", "start", "first", "last", "probe", "rotation", "ate")
+    }
     result["flow90"] = float(joined["flow"][:: max(1, len(joined["flow"]) // 1000000)].quantile(0.9))
     result["lost"] = float((joined["ate"] > 0.3).float().mean())
     result["probe_ratio"] = float(joined["probe_length"].median() / joined["probe_true"].median().clamp(min=1e-6))
@@ -62,9 +66,19 @@ def validate(network: eVONet, clips: TrainingClips, settings: ValidationSettings
 
 def _figures(network: eVONet, clips: TrainingClips, settings: ValidationSettings) -> dict[str, Tensor]:
     unrolled = unroll_clips(
-        network, network.normalize(clips.voxels), SE3(clips.world_T_cam).inv(), clips.inv_depths, clips.intrinsics,
-        UnrollSettings(steps=settings.updates, patches_per_image=settings.patches, drop_probability=0.0, probe=True,
-                       initial_frames=settings.initial_frames))
+        network,
+        network.normalize(clips.voxels),
+        SE3(clips.world_T_cam).inv(),
+        clips.inv_depths,
+        clips.intrinsics,
+        UnrollSettings(
+            steps=settings.updates,
+            patches_per_image=settings.patches,
+            drop_probability=0.0,
+            probe=True,
+            initial_frames=settings.initial_frames,
+        ),
+    )
     first, last = unrolled.steps[0], unrolled.steps[-1]
     probe = unrolled.probe
     assert probe is not None and last.coords is not None and last.poses is not None
@@ -88,7 +102,7 @@ def _trajectory_errors(unrolled: UnrollResult) -> tuple[Tensor, Tensor]:
     """Rotation errors of frame pairs in degrees, and rms position error over path length of each clip."""
     poses = unrolled.steps[-1].poses
     assert poses is not None
-    truth = unrolled.poses_gt[:, :poses.shape[1]]
+    truth = unrolled.poses_gt[:, : poses.shape[1]]
     _, rotation = pose_errors(poses.data, truth.data)
     centres, centres_gt = poses.inv().data[..., :3], truth.inv().data[..., :3]
     scale = alignment_scale(centres_gt, centres, limit=1e6)[:, None, None]

@@ -1,0 +1,112 @@
+"""Correlation features for training: the same maps looked up again and again, differentiable to both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from devo.altcorr.correlation import corr, draw_kept_edges
+from devo.altcorr.volumes import Lookup, Volume, volume_shape
+from devo.errors import InputError
+
+MAX_VOLUME_BYTES = 1 << 31
+"""Largest correlation volumes kept in memory; bigger samples are correlated edge by edge instead."""
+
+
+class CorrBlock:
+    """Pyramid correlation of fixed maps at positions that change from call to call.
+
+    On the CPU all products of patch and map pixels of each clip are computed once (`devo.altcorr.volumes`), which makes
+    every further call and its backward pass cheap; where they would exceed `MAX_VOLUME_BYTES`, and on other devices,
+    each call runs `corr` per level. Both give the same result up to the rounding of sums.
+
+    Args:
+        fmap: (1, F, C, H, W) feature maps, clip after clip.
+        gmap: (1, K, C, P, P) patch features, clip after clip.
+        radius: R, largest shift.
+        dropout: probability with which an edge takes part in the backward pass of a call, without rescaling.
+        levels: divisors of the pyramid; level l is `fmap` average-pooled in blocks of `levels[l]` pixels.
+        clips: number of equally long clips joined in the sample; edges never connect two of them.
+        compute_dtype: dtype of the products, by default the one both maps promote to; bfloat16 is faster where the CPU
+            multiplies it in hardware.
+        generator: source of the randomness of `dropout`.
+
+    Raises:
+        InputError: shapes do not fit together, or frames or patches cannot be split evenly into `clips`.
+    """
+
+    def __init__(
+        self,
+        fmap: Tensor,
+        gmap: Tensor,
+        radius: int = 3,
+        dropout: float = 0.2,
+        levels: Sequence[int] = (1, 4),
+        *,
+        clips: int = 1,
+        compute_dtype: torch.dtype | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if fmap.dim() != 5 or gmap.dim() != 5 or fmap.shape[:3:2] != (1, gmap.shape[2]) or gmap.shape[0] != 1:
+            found = f"{tuple(fmap.shape)} and {tuple(gmap.shape)}"
+            raise InputError(f"CorrBlock got maps of shape {found}; expected (1, F, C, H, W) and (1, K, C, P, P)")
+        if clips < 1 or fmap.shape[1] % clips or gmap.shape[1] % clips or not 0 <= dropout <= 1:
+            found = f"{fmap.shape[1]} frames, {gmap.shape[1]} patches, clips={clips}, dropout={dropout}"
+            raise InputError(f"CorrBlock got {found}; expected multiples of clips >= 1 and a probability")
+        self.radius, self.dropout, self.levels, self.clips = radius, dropout, tuple(levels), clips
+        self.generator = generator
+        self.frames, self.patches = fmap.shape[1] // clips, gmap.shape[1] // clips
+        self.dtype = torch.promote_types(fmap.dtype, gmap.dtype)
+        compute = compute_dtype or self.dtype
+        with torch.autocast(fmap.device.type, enabled=False):
+            self.gmap = gmap.to(compute)
+            pooled = [torch.nn.functional.avg_pool2d(fmap[0], n, n)[None] if n > 1 else fmap for n in self.levels]
+            self.pyramid = [level.to(compute) for level in pooled]
+            size = sum(math.prod(volume_shape(gmap, level, radius, clips)) for level in self.pyramid) * compute.itemsize
+            self.volumes: list[Volume] | None = None
+            if fmap.device.type == "cpu" and size <= MAX_VOLUME_BYTES:
+                self.volumes = [Volume(self.gmap, level, radius, clips) for level in self.pyramid]
+
+    def __call__(self, ii: Tensor, jj: Tensor, coords: Tensor) -> Tensor:
+        """Correlate patches with frames around the given positions.
+
+        Args:
+            ii: (E,) int64, row of `gmap` for each edge.
+            jj: (E,) int64, row of `fmap` for each edge.
+            coords: (1, E, 2, P, P) float32 positions (x, y) in pixels of `fmap`; no gradient flows to them.
+
+        Returns:
+            (1, E, (2R+1)**2 * P*P * L) in the dtype of the maps; index (((xo*(2R+1) + yo)*P + i)*P + j)*L + l, see
+            `corr` for the meaning of the shifts xo and yo.
+
+        Raises:
+            InputError: shapes do not fit together, or an edge leaves its clip or the sample.
+        """
+        patch = self.gmap.shape[-1]
+        if ii.shape != jj.shape or ii.dim() != 1 or coords.shape != (1, len(ii), 2, patch, patch):
+            found = f"coords {tuple(coords.shape)}, ii {tuple(ii.shape)}, jj {tuple(jj.shape)}"
+            raise InputError(f"CorrBlock got {found}; expected (1, E, 2, {patch}, {patch}), (E,) and (E,)")
+        coords = coords.detach()
+        if self.volumes is None:
+            return self._by_corr(ii, jj, coords)
+        clip = ii // self.patches
+        if bool(((ii < 0) | (clip >= self.clips) | (clip != jj // self.frames)).any()):
+            expected = f"{self.clips} clips of {self.patches} patches and {self.frames} frames"
+            raise InputError(f"CorrBlock got edges between clips or out of range; expected edges within {expected}")
+        keep = None
+        tokens = [volume.token for volume in self.volumes]
+        if self.dropout < 1 and torch.is_grad_enabled() and any(token.requires_grad for token in tokens):
+            keep = draw_kept_edges(len(ii), self.dropout, coords.device, self.generator)
+        positions = coords[0].flatten(2)
+        features = Lookup.apply(positions, ii, jj, keep, self.volumes, self.levels, self.dtype, *tokens)
+        return features.view(1, len(ii), -1)
+
+    def _by_corr(self, ii: Tensor, jj: Tensor, coords: Tensor) -> Tensor:
+        levels = [
+            corr(self.gmap, level, coords / n, ii, jj, self.radius, self.dropout, generator=self.generator)
+            for level, n in zip(self.pyramid, self.levels, strict=True)
+        ]
+        return torch.stack(levels, dim=-1).flatten(2).to(self.dtype)

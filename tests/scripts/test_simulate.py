@@ -1,0 +1,76 @@
+"""The command line of the simulator."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts.cli import run_cli
+from scripts.simulate import main
+
+
+def test_help_does_not_import_torch(repository: Path) -> None:
+    code = ("import runpy, sys\nsys.argv = ['simulate.py', '--help']\n"
+            "try:\n    runpy.run_path('scripts/simulate.py', run_name='__main__')\n"
+            "except SystemExit as leave:\n    assert leave.code == 0\n"
+            "heavy = {'torch', 'numpy', 'cv2', 'h5py'} & set(sys.modules)\nassert not heavy, heavy\n")
+    done = subprocess.run([sys.executable, "-c", code], cwd=repository, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--scene" in done.stdout
+    assert "[px]" in done.stdout
+
+
+def test_a_recording_is_written_and_summarised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "board"
+    arguments = ["--scene", "board", "--out", str(out), "--seconds", "0.1", "--seed", "1", "--size", "48x36",
+                 "--preset", "fast", "--no-depth", "--frames"]
+    assert run_cli(main, arguments) == 0
+    output = capsys.readouterr()
+    assert "events in 0.1 s" in output.out
+    assert "thousand a second" in output.out
+    assert "simulating" in output.err
+    assert sorted(path.name for path in out.iterdir()) == [
+        "calib.yaml", "events.h5", "groundtruth.txt", "images", "images_timestamps_us.txt", "scene.json"]
+    assert run_cli(main, arguments) == 2, "it exists now"
+    assert "--overwrite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), [
+    (["--size", "0x0"], 2, "image size"),
+    (["--size", "big"], 2, "WIDTHxHEIGHT"),
+    (["--seconds", "-3"], 2, "seconds"),
+    (["--seed", "-3"], 2, "seed"),
+    (["--fps", "0"], 2, "images per second"),
+    (["--threshold", "nan"], 2, "threshold"),
+    (["--device", "tpu9"], 2, "device"),
+    (["--device", "cuda:77"], 2, "not available"),
+])
+def test_bad_arguments_give_one_line(arguments: list[str], code: int, words: str, tmp_path: Path,
+                                     capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli(main, ["--out", str(tmp_path / "x"), *arguments]) == code
+    error = capsys.readouterr().err.strip()
+    assert words in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "x").exists()
+
+
+def test_unwritable_output_is_a_failed_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert run_cli(main, ["--out", str(blocked / "x"), "--seconds", "0.1", "--size", "32x24"]) == 1
+    error = capsys.readouterr().err.strip()
+    assert "cannot write" in error
+    assert len(error.splitlines()) == 1
+    assert run_cli(main, ["--out", str(blocked)]) == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["--out"], ["--scene", "moon", "--out", "x"], ["--unknown", "--out", "x"], []])
+def test_wrong_command_lines_exit_with_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as leave:
+        main(arguments)
+    assert leave.value.code == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
