@@ -1,8 +1,8 @@
-"""Correlation for training: products of all patches with all frames of a clip once per sample, windows looked up per update.
+"""Correlation for training: all patches times all frames of a clip once per sample, windows looked up per update.
 
-The same features as `devo.altcorr.corr` on two levels, cheaper where every patch meets every frame several times. Maps carry
-a margin of zeros above and to the right: a window that leaves the map on the left or below reads the margin of the row or
-map before it, so no lookup needs a mask.
+The same features as `devo.altcorr.corr` on two levels, cheaper where every patch meets every frame several times. Maps
+carry a margin of zeros before the first column and after each one (columns are stored one after the other): a window
+that leaves the map anywhere reads a margin, so no lookup needs a mask.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class _Level:
         return _Lookup.apply(self.token, self, pair, coords / self.factor)
 
     def window_starts(self, pair: Tensor, coords: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """First element (E,8,P*P) of each stored row of the windows, relative to the pair's maps, and the fractions (E,P*P)."""
+        """First elements (E,8,P*P) of the windows' columns, counted from the pair's maps; fractions (E,P*P)."""
         base = coords.floor()
         x_fraction, y_fraction = (coords - base).unbind(1)
         x = base[:, 0].nan_to_num(-1e6).clamp(-1e6, 1e6).long().sub_(RADIUS).clamp_(-MARGIN, self.width) + MARGIN

@@ -227,7 +227,7 @@ class DEVO(PatchGraph):
         self.patches_[n] = patches
 
     def _initial_inv_depths(self) -> Tensor:
-        """Inverse depths of a new frame's patches, `(M,1,1)`: the median of the last three keyframes once there is one."""
+        """Inverse depths of a new frame's patches, `(M,1,1)`: the median of the last three keyframes if possible."""
         start = self.patches_[0, :, 2, :1, :1]
         if self.is_initialized:
             return torch.full_like(start, float(self.patches_[self.n - 3:self.n, :, 2].median()))
@@ -289,11 +289,12 @@ class DEVO(PatchGraph):
         self.net, delta, self.weight_ = self._revise(self.net, coords, self.ii, self.jj, self.kk)
         centre = self.P // 2
         self.target_ = coords[:, :, :, centre, centre] + delta
+        height, width = self.fmap1_.shape[-2:]
         first_free = max(self.n - self.cfg.OPTIMIZATION_WINDOW, 1) if self.is_initialized else 1
         with self._timed("ba"):
             solved = fastba.BA(self.poses_[None], self.patches, self.intrinsics, self.target_, self.weight_,
                                torch.tensor([_DAMPING], device=self.device), self.ii, self.jj, self.kk,
-                               first_free, self.n, 2, image_size=tuple(self.fmap1_.shape[-2:]))
+                               first_free, self.n, 2, image_size=(height, width), accurate=True)
         self.counters["updates"] += 1
         self.counters["ba_failures"] += not solved.success
         self._last_solve = solved

@@ -81,15 +81,19 @@ class Patchifier(nn.Module):
             with the scorer, the colours (1, N*M, 1 or 3) in evaluation with `return_color`, else None.
 
         Raises:
-            InputError: wrong number of channels, frames too small, or misplaced `coords`.
+            InputError: wrong number of channels, frames too small, `disps` of another size or misplaced `coords`.
         """
         if images.dim() != 5 or images.shape[2] != self.channels:
             raise InputError(
                 f"images have shape {tuple(images.shape)}; this network expects (B, n, {self.channels}, H, W)"
             )
+        clips = images.shape[:2]
         images = channels_last_frames(images)
         fmap = self.fnet.encode(images) / FEATURE_SCALE
         frames, _, height, width = fmap.shape
+        if disps is not None and disps.shape != (*clips, height, width):
+            expected = (*clips, height, width)
+            raise InputError(f"inverse depths disps have shape {tuple(disps.shape)}; expected {expected}")
         if coords is None:
             method, grid = scorer_eval_mode, scorer_eval_use_grid
             x, y, scores = self._select(images, (height, width), patches_per_image, method, grid, generator)

@@ -1,7 +1,7 @@
 """Forward pass of training: the update operator and bundle adjustment, unrolled over a growing patch graph.
 
-Several clips of equal length are joined into one block-diagonal graph: frame `f` of clip `c` has index `c*n + f`, patch `p`
-of clip `c` has index `c*n*M + p`. All clips have the same edges, so that every operation runs once for all of them.
+Several clips of equal length are joined into one block-diagonal graph: frame `f` of clip `c` has index `c*n + f`, patch
+`p` of clip `c` has index `c*n*M + p`. All clips have the same edges, so that every operation runs once for all of them.
 """
 
 from __future__ import annotations
@@ -111,9 +111,9 @@ def unroll_clips(
     poses: SE3,
     disps: Tensor,
     intrinsics: Tensor,
-    settings: UnrollSettings = UnrollSettings(),
+    settings: UnrollSettings | None = None,
     start_fraction: Tensor | None = None,
-) -> UnrollResult:  # noqa: B008
+) -> UnrollResult:
     """Run the training pass on B clips of n frames.
 
     Args:
@@ -129,6 +129,7 @@ def unroll_clips(
         InputError: shapes that do not fit.
     """
     _check_shapes(images, disps, intrinsics)
+    settings = settings or UnrollSettings()
     clips = JoinedClips(network, images, poses, disps, intrinsics, settings)
     if not settings.structure_only:
         clips.poses = clips.start_poses(start_fraction)
@@ -184,40 +185,45 @@ def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, m
     start_error = (centre - truth).norm(dim=-1)
     near = graph.select(graph.near)
     moved = pops.transform(clips.poses, clips.patches, clips.intrinsics, *near) if differentiable else None
-    full = _full_report(clips, graph, weight) if last else (None,) * 7
-    return UnrollStep(
-        graph.valid[:, graph.near].reshape(1, -1),
-        moved,
-        graph.coords_gt[:, graph.near].reshape(1, -1, *graph.coords_gt.shape[2:]),
-        clips.poses_of(graph.frames) if differentiable else None,
-        clips.patches,
-        0.0,
-        *full,
-        target,
-        truth,
-        graph.visible.reshape(1, -1),
-        weight,
-        start_error,
+    step = UnrollStep(
+        valid=graph.valid[:, graph.near].reshape(1, -1),
+        coords=moved,
+        coords_gt=graph.coords_gt[:, graph.near].reshape(1, -1, *graph.coords_gt.shape[2:]),
+        poses=clips.poses_of(graph.frames) if differentiable else None,
+        patches=clips.patches,
+        kl=0.0,
+        scores=None,
+        valid_full=None,
+        coords_full=None,
+        coords_gt_full=None,
+        weight_full=None,
+        kk_full=None,
+        frame_distance=None,
+        predicted=target,
+        predicted_gt=truth,
+        predicted_valid=graph.visible.reshape(1, -1),
+        weight=weight,
+        start_error=start_error,
     )
+    return _with_scores(step, clips, graph) if last else step
 
 
-def _full_report(clips: JoinedClips, graph: GrowingGraph, weight: Tensor) -> tuple[Tensor | None, ...]:
-    """What the scorer loss needs, without gradients except through the scores."""
+def _with_scores(step: UnrollStep, clips: JoinedClips, graph: GrowingGraph) -> UnrollStep:
+    """Add what the scorer loss needs, without gradients except through the scores."""
     from devo import projective_ops as pops
 
     local = graph.scored
     edges = graph.select(local)
     with torch.no_grad():
         coords = pops.transform(clips.poses, clips.patches, clips.intrinsics, *edges)
-    chosen = weight.detach().view(clips.clips, -1, 2)[:, local].reshape(1, -1, 2)
-    return (
-        clips.scores,
-        graph.valid[:, local].reshape(1, -1),
-        coords,
-        graph.coords_gt[:, local].reshape(1, -1, *graph.coords_gt.shape[2:]),
-        chosen,
-        edges[2],
-        graph.distance[local].repeat(clips.clips),
+    return step._replace(
+        scores=clips.scores,
+        valid_full=graph.valid[:, local].reshape(1, -1),
+        coords_full=coords,
+        coords_gt_full=graph.coords_gt[:, local].reshape(1, -1, *graph.coords_gt.shape[2:]),
+        weight_full=step.weight.detach().view(clips.clips, -1, 2)[:, local].reshape(1, -1, 2),
+        kk_full=edges[2],
+        frame_distance=graph.distance[local].repeat(clips.clips),
     )
 
 

@@ -113,7 +113,7 @@ class JoinedClips:
         return SE3.exp(tangent.view(1, -1, 6))
 
     def start_frame(self, new: int) -> None:
-        """Pose of frame `new` of each clip := pose of the frame before; its depths := median of the two frames before."""
+        """Start frame `new` of each clip: pose of the frame before, depths at the median of the two frames before."""
         from devo.lietorch import SE3
 
         if not self.settings.structure_only:

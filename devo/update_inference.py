@@ -26,8 +26,8 @@ CHUNK_ROWS = 2048
 CUDA_CHUNK_ROWS = 65536
 # Matrix products on the CPU are compiled for each new number of rows, which costs ten times the product itself, and
 # a tracker's graph has other sizes in every frame. So rows and groups are padded to multiples of these.
-ROW_STEP = 1
-GROUP_STEP = 1
+ROW_STEP = 128
+GROUP_STEP = 64
 
 
 class _Piece:

@@ -12,12 +12,11 @@ LIE_SLOPE = 1e-8  # second-order differences with steps of 1e-5, float64
 TRANSFORM = 1e-4  # of the largest value; pixels 2.2e-7, Jacobians 3.5e-7
 REPROJECTION = 1e-5  # pixels relative to 1 + |pixel|; 3.0e-6
 REPROJECT_EDGES = 1e-5  # of the largest pixel, against transform; 2.2e-7
-BA_ONE_STEP = 1e-4  # poses; 5.5e-5
-# Depths: Euclidean norm of the error over that of the depths, 1.9e-4. The free scale has an eigenvalue of 6 beside
-# 3.5e5, so the float32 reference is itself uncertain there: its own formulas differ from it by 2.8e-4 at most in
-# float64, and by 3.6e-4 in float32 with another order of summation.
-BA_ONE_STEP_DEPTHS = 5e-4
-BA_TWO_STEPS = 1e-3  # poses 9.4e-5, depths (as above) 2.2e-4
+BA_ONE_STEP = 1e-4  # absolute, published order; poses 4.9e-6, inverse depths 2.3e-5
+BA_TWO_STEPS = 1e-3  # absolute, published order; poses 4.4e-5, inverse depths 1.6e-4
+# The accurate solver against the float32 reference, relative norms: poses 5.5e-5, depths 2.2e-4. The free scale has an
+# eigenvalue of 6 beside 3.5e5, so the reference itself is uncertain by that much.
+BA_ACCURATE = 5e-4
 BA_TRAINING = 1e-3  # relative and absolute; poses 1.2e-4, depths 5.0e-4
 BA_TRAINING_GRADIENT = 1e-3  # of the largest entry; target 1.7e-4, weight 9.0e-5
 BA_CLIPS = 1e-4  # float32, joined against separate clips

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from devo.altcorr.correlation import corr, draw_kept_edges
-from devo.altcorr.volumes import Lookup, Volume, volume_shape
+from devo.altcorr.volumes import Volume, look_up, volume_shape
 from devo.errors import InputError
 
 MAX_VOLUME_BYTES = 1 << 31
@@ -97,11 +97,11 @@ class CorrBlock:
             expected = f"{self.clips} clips of {self.patches} patches and {self.frames} frames"
             raise InputError(f"CorrBlock got edges between clips or out of range; expected edges within {expected}")
         keep = None
-        tokens = [volume.token for volume in self.volumes]
-        if self.dropout < 1 and torch.is_grad_enabled() and any(token.requires_grad for token in tokens):
+        differentiated = any(volume.token.requires_grad for volume in self.volumes)
+        if self.dropout < 1 and torch.is_grad_enabled() and differentiated:
             keep = draw_kept_edges(len(ii), self.dropout, coords.device, self.generator)
         positions = coords[0].flatten(2)
-        features = Lookup.apply(positions, ii, jj, keep, self.volumes, self.levels, self.dtype, *tokens)
+        features = look_up(self.volumes, self.levels, positions, ii, jj, keep, self.dtype)
         return features.view(1, len(ii), -1)
 
     def _by_corr(self, ii: Tensor, jj: Tensor, coords: Tensor) -> Tensor:

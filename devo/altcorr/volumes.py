@@ -113,6 +113,33 @@ def volume_shape(gmap: Tensor, maps: Tensor, radius: int, clips: int) -> tuple[i
     return clips, rows, maps.shape[1] // clips * maps.shape[-2] * (maps.shape[-1] + 2 * radius + 2)
 
 
+def look_up(
+    volumes: list[Volume],
+    scales: tuple[int, ...],
+    coords: Tensor,
+    kk: Tensor,
+    jj: Tensor,
+    keep: Tensor | None,
+    dtype: torch.dtype,
+) -> Tensor:
+    """Features of all levels, differentiable to the maps of the volumes.
+
+    Args:
+        volumes: one per level.
+        scales: divisor of the positions at each level.
+        coords: (E, 2, P*P) positions (x, y) in pixels of scale 1.
+        kk: (E,) int64 patch of each edge.
+        jj: (E,) int64 frame of each edge, in the same clip.
+        keep: int64 numbers of the edges that take part in the backward pass; `None` for all.
+        dtype: dtype of the result.
+
+    Returns:
+        (E, x-shift, y-shift, P*P, levels).
+    """
+    tokens = [volume.token for volume in volumes]
+    return _Lookup.apply(coords, kk, jj, keep, volumes, scales, dtype, *tokens)
+
+
 class _Products(torch.autograd.Function):
     """Fills a `Volume`; its backward pass runs after those of all lookups and turns their sum into map gradients."""
 
@@ -128,7 +155,7 @@ class _Products(torch.autograd.Function):
         return (*ctx.volume.map_gradients(), None)
 
 
-class Lookup(torch.autograd.Function):
+class _Lookup(torch.autograd.Function):
     """Features (E, x-shift, y-shift, P*P, levels) at (E, 2, P*P) level-0 positions; gradients go to the volumes."""
 
     @staticmethod

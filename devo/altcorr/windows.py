@@ -20,9 +20,9 @@ def split_coords(coords: Tensor) -> tuple[Tensor, Tensor]:
         coords: positions in pixels, any shape, floating point.
 
     Returns:
-        `base`, floor of the position in the dtype of `coords`, clamped to +-`FAR` (NaN becomes `-FAR`) so that a cast to
-        an integer type is safe and exact, and `fraction` in [0, 1); NaN and infinite positions have the fraction NaN,
-        so whatever is blended with it is NaN.
+        `base`, floor of the position in the dtype of `coords`, clamped to +-`FAR` (NaN becomes `-FAR`) so that a cast
+        to an integer type is safe and exact, and `fraction` in [0, 1); NaN and infinite positions have the fraction
+        NaN, so whatever is blended with it is NaN.
     """
     floor = coords.floor()
     return floor.nan_to_num(nan=-FAR, posinf=FAR, neginf=-FAR).clamp_(-FAR, FAR), coords - floor

@@ -18,14 +18,15 @@ class TrainingClips:
     """B clips of n frames with perfect ground truth.
 
     Attributes:
-        voxels: (B,n,5,H,W) float32 voxel grids of adjacent time windows, not normalised; pose i belongs to the middle of window i.
+        voxels: (B,n,5,H,W) float32 voxel grids of adjacent time windows, not normalised; pose i belongs to the middle
+            of window i.
         world_T_cam: (B,n,7) float32 camera -> world, `tx ty tz qx qy qz qw`.
         inv_depths: (B,n,H,W) float32 inverse z-depth in the unit of the poses.
         intrinsics: (B,n,4) float32 fx fy cx cy in full-resolution pixels.
     """
 
     voxels: Tensor
-    world_T_cam: Tensor
+    world_T_cam: Tensor  # noqa: N815 - names carry their frames
     inv_depths: Tensor
     intrinsics: Tensor
 
@@ -74,7 +75,7 @@ class TrainingClips:
         return TrainingClips(*(torch.cat(values) for values in zip(*(part.tensors() for part in parts))))
 
     def with_unit_depth(self) -> TrainingClips:
-        """Scale each clip so that near points have inverse depth about 1.4 (published: 0.7 of the 98 % quantile becomes 1)."""
+        """Scale each clip so that 0.7 of the 98 % quantile of its inverse depths becomes 1, as published."""
         flat = self.inv_depths.flatten(1)
         flat = flat[:, :: max(1, flat.shape[1] // QUANTILE_SAMPLES)]
         scale = (0.7 * torch.quantile(flat, 0.98, dim=1)).clamp(min=1e-6)

@@ -1,4 +1,4 @@
-"""TartanAir clips: frame graph by induced flow, clip sampling, conversion of poses and depths. No files are read here."""
+"""TartanAir clips: frame graph by induced flow, clip sampling, conversion of poses and depths; no files are read."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def walk(
     rng: np.random.Generator,
     flow_range: tuple[float, float] = (10.0, 75.0),
 ) -> list[int]:
-    """Frame numbers of one clip: each step goes to a random later neighbour whose flow lies inside `flow_range` pixels."""
+    """Frame numbers of one clip: always on to a random later neighbour whose flow lies inside `flow_range` pixels."""
     chosen = [start]
     while len(chosen) < frames:
         i = chosen[-1]
@@ -129,7 +129,7 @@ def walk(
 
 @dataclass(frozen=True)
 class TartanScene:
-    """One recording; voxel k belongs to pose and depth k (the first frame of the recording, without a voxel, is dropped).
+    """One recording; voxel k belongs to pose and depth k (the recording's first frame has no voxel and is dropped).
 
     Attributes:
         name: scene string of the split files.
@@ -139,7 +139,7 @@ class TartanScene:
     """
 
     name: str
-    world_T_cam: np.ndarray
+    world_T_cam: np.ndarray  # noqa: N815
     graph: list[tuple[np.ndarray, np.ndarray]]
     load: Callable[[int], tuple[np.ndarray, np.ndarray]]
 

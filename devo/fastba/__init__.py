@@ -34,6 +34,7 @@ def BA(  # noqa: N802 - the published name
     *,
     image_size: tuple[float, float] | None = None,
     per_frame_intrinsics: bool = False,
+    accurate: bool = False,
 ) -> BAResult:
     """Refine poses `t0 <= i < t1` and the inverse depth of all patches in `kk` by Gauss-Newton, in place.
 
@@ -57,6 +58,9 @@ def BA(  # noqa: N802 - the published name
         image_size: (height, width) in feature-map pixels; default (2 cy, 2 cx) of the camera, as published. Projections
             more than 64 pixels outside are outliers.
         per_frame_intrinsics: use the camera of each frame instead of row 0 for all.
+        accurate: set up and solve in float64 over blocks of frame pairs, several times faster on large problems;
+            otherwise in the dtype of the state in the order of the published kernel, whose rounding errors are
+            reproduced. The tracker uses the former; the two agree where the problem is well determined.
 
     Returns:
         `BAResult`, see there.
@@ -65,7 +69,8 @@ def BA(  # noqa: N802 - the published name
         devo.errors.InputError: shapes do not fit together.
     """
     kernel = cuda_kernel("fastba", poses.data, patches, target)
-    options: dict[str, Any] = {"image_size": image_size, "per_frame_intrinsics": per_frame_intrinsics}
+    options: dict[str, Any] = {"image_size": image_size, "per_frame_intrinsics": per_frame_intrinsics,
+                               "accurate": accurate}
     arguments = (patches, intrinsics, target, weight, lmbda, ii, jj, kk, t0, t1, iterations)
     if kernel is not None:
         return BAResult(*kernel.ba(poses.data, *arguments, **options))

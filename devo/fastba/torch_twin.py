@@ -1,7 +1,9 @@
 """Torch twin of the bundle adjustment kernel: the specification, on any device.
 
-State is read and written in the caller's dtype; linearisation and solution run in float64, because the normal matrix
-of a monocular problem is nearly singular along the free scale, where float32 leaves little more than rounding errors.
+State is read and written in the caller's dtype. The normal matrix of a monocular problem is nearly singular along the
+free scale, where float32 leaves little more than rounding errors. So there are two ways to set up and solve it: in
+float32 in the order of the published kernel, for parity with it, and in float64 over blocks of frame pairs, which is
+faster and accurate.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import torch
 from torch import Tensor
 
 from devo.errors import InputError
+from devo.fastba.published_order import Edges, linearize
 from devo.graph import PairBlocks, frame_pairs, pair_blocks, relative_poses, unique_with_inverse
 from devo.lietorch import SE3
 from devo.lietorch.quaternion import quat_normalize
@@ -137,11 +140,73 @@ def _step(
     return dX, dZ[0], usable, C[0], seen.valid, seen.residual
 
 
+class _BlockProblem:
+    """The problem in float64, over blocks of frame pairs."""
+
+    def __init__(self, poses: Tensor, patches: Tensor, intrinsics: Tensor, target: Tensor, weight: Tensor, ii: Tensor,
+                 jj: Tensor, kk: Tensor, patch_of_edge: Tensor, count: int, t0: int, t1: int, lmbda: Tensor,
+                 image_size: tuple[float, float] | None, per_frame: bool) -> None:
+        self.poses, self.lmbda, self.target = poses, lmbda, target
+        self.blocks, self.layout, self.moving = _arrange(ii, jj, patch_of_edge, count, t0, t1)
+        self.measurements = _measure(self.blocks, patches, intrinsics, target, weight, kk, image_size, per_frame)
+        self.valid = torch.zeros_like(self.blocks.used)
+        self.residual = torch.zeros_like(self.measurements.target)
+
+    def step(self, inv_depth: Tensor) -> tuple[Tensor | None, Tensor, Tensor, Tensor]:
+        """Pose step, depth step, whether they can be used, and C."""
+        dX, dZ, usable, information, self.valid, self.residual = _step(
+            self.poses, inv_depth.double(), self.blocks, self.measurements, self.layout, self.moving, self.lmbda)
+        return dX, dZ, usable, information
+
+    def verdict(self) -> tuple[Tensor, Tensor]:
+        """Per edge: valid `(E,)` and residual `(E,2)` at the last linearisation."""
+        edge, used = self.blocks.edge[self.blocks.used], self.blocks.used
+        valid = torch.zeros(len(self.target), dtype=torch.bool, device=self.target.device)
+        valid[edge] = self.valid[used]
+        residual = torch.zeros_like(self.target)
+        residual[edge] = self.residual[:, used].t().to(self.target.dtype)
+        return valid, residual
+
+
+class _PublishedProblem:
+    """The same problem in the caller's dtype, in the order of the published kernel."""
+
+    def __init__(self, poses: Tensor, patches: Tensor, intrinsics: Tensor, target: Tensor, weight: Tensor, ii: Tensor,
+                 jj: Tensor, kk: Tensor, patch_of_edge: Tensor, count: int, t0: int, t1: int, lmbda: Tensor,
+                 image_size: tuple[float, float] | None, per_frame: bool) -> None:
+        middle = patches.shape[-1] // 2
+        camera = intrinsics[jj] if per_frame else intrinsics[:1]
+        source = intrinsics[ii] if per_frame else camera
+        upper = 2 * camera[:, 2:] if image_size is None else camera.new_tensor([[image_size[1], image_size[0]]])
+        centre = patches[kk, :, middle, middle]
+        ray = torch.cat(((centre[:, :2] - source[:, 2:]) / source[:, :2], torch.ones_like(centre[:, :1])), 1)
+        whole = torch.isfinite(poses).all(1) & (poses[:, 3:] != 0).any(1)
+        usable = torch.isfinite(torch.cat((ray, centre, target, weight), 1)).all(1) & whole[ii] & whole[jj]
+        ray, target, weight = (torch.where(usable[:, None], rows, 0.0) for rows in (ray, target, weight))
+        self.edges = Edges(ray, target, weight, usable, camera, upper + MARGIN, MARGIN, MAX_RESIDUAL, ii, jj,
+                           patch_of_edge)
+        self.poses, self.lmbda = poses, lmbda.to(poses.dtype)
+        self.t0, self.free, self.count = t0, max(t1 - t0, 0), count
+        self.valid, self.residual = torch.zeros_like(usable), torch.zeros_like(target)
+
+    def step(self, inv_depth: Tensor) -> tuple[Tensor | None, Tensor, Tensor, Tensor]:
+        """Pose step, depth step, whether they can be used, and C."""
+        s = linearize(self.poses, inv_depth, self.edges, self.t0, self.free, self.count)
+        self.valid, self.residual = s.valid, s.residual
+        system = (s.B[None], s.E[None], s.v[None, :, None]) if self.free else None
+        dX, dZ, solved = solve(s.C[None], s.u[None], system, self.lmbda, POSE_DAMPING)
+        return dX, dZ[0], solved[0] & torch.isfinite(dZ).all(), s.C
+
+    def verdict(self) -> tuple[Tensor, Tensor]:
+        """Per edge: valid `(E,)` and residual `(E,2)` at the last linearisation."""
+        return self.valid, self.residual
+
+
 def _apply(poses: Tensor, depths: Tensor, dX: Tensor | None, dZ: Tensor, t0: int) -> Tensor:
     """Move the poses in place and return the new depths; numbers that are not finite stay what they are."""
     if dX is not None:
         moved = poses[t0 : t0 + dX.shape[1]]
-        new = SE3.exp(dX[0]).mul(SE3(moved.double())).data
+        new = SE3.exp(dX[0].double()).mul(SE3(moved.double())).data
         new = torch.cat((new[:, :3], quat_normalize(new[:, 3:])), 1)
         moved.copy_(torch.where(torch.isfinite(new).all(1, keepdim=True), new.to(moved.dtype), moved))
     new = depths + dZ.to(depths.dtype)
@@ -166,6 +231,7 @@ def ba(
     *,
     image_size: tuple[float, float] | None = None,
     per_frame_intrinsics: bool = False,
+    accurate: bool = False,
 ) -> BAResult:
     """Torch twin of `devo.fastba.BA`; the same arguments (poses as tensor) and results.
 
@@ -181,33 +247,21 @@ def ba(
         return BAResult(True, 0, kk.clone(), nothing.double()[:, 0], nothing[:, 0].bool(), nothing)
     t0, t1 = max(int(t0), 0), min(int(t1), pose_rows.shape[0])
     patch_ids, patch_of_edge = unique_with_inverse(kk)
-    blocks, layout, moving = _arrange(ii, jj, patch_of_edge, patch_ids.numel(), t0, t1)
-    measurements = _measure(
-        blocks, patch_rows, _rows(intrinsics, 2, "intrinsics"), target_rows, weight_rows, kk, image_size,
-        per_frame_intrinsics,
-    )  # fmt: skip
     damping = torch.as_tensor(lmbda, dtype=torch.float64, device=patch_rows.device).reshape(())
+    problem = (_BlockProblem if accurate else _PublishedProblem)(
+        pose_rows, patch_rows, _rows(intrinsics, 2, "intrinsics"), target_rows, weight_rows, ii, jj, kk, patch_of_edge,
+        patch_ids.numel(), t0, t1, damping, image_size, per_frame_intrinsics)
     middle = patch_rows.shape[-1] // 2
     done, success = 0, True
     information = damping.new_zeros(patch_ids.numel())
-    valid, residual = torch.zeros_like(blocks.used), torch.zeros_like(measurements.target)
     for _ in range(iterations):
-        centre_depths = patch_rows[patch_ids, 2, middle, middle].double()
-        dX, dZ, usable, information, valid, residual = _step(
-            pose_rows, centre_depths, blocks, measurements, layout, moving, damping
-        )
+        dX, dZ, usable, information = problem.step(patch_rows[patch_ids, 2, middle, middle])
         if not bool(usable):
             success = False
             break
-        depths = _apply(pose_rows, patch_rows[patch_ids, 2, 0, 0], dX, dZ, t0)
-        patch_rows[patch_ids, 2] = depths[:, None, None]
+        patch_rows[patch_ids, 2] = _apply(pose_rows, patch_rows[patch_ids, 2, 0, 0], dX, dZ, t0)[:, None, None]
         done += 1
-    edge = blocks.edge[blocks.used]
-    valid_edges = torch.zeros_like(kk, dtype=torch.bool)
-    valid_edges[edge] = valid[blocks.used]
-    residual_edges = torch.zeros_like(target_rows)
-    residual_edges[edge] = residual[:, blocks.used].t().to(target.dtype)
-    return BAResult(success, done, patch_ids, information, valid_edges, residual_edges)
+    return BAResult(success, done, patch_ids, information.double(), *problem.verdict())
 
 
 @torch.no_grad()

@@ -20,9 +20,9 @@ from devo.graph import adjoint_matrices
 from devo.lietorch import SE3
 from tests.devo.worlds import World, centre_pixels, dense_step, make_world
 from tests.tolerances import (
+    BA_ACCURATE,
     BA_DENSE_STEP,
     BA_ONE_STEP,
-    BA_ONE_STEP_DEPTHS,
     BA_TWO_STEPS,
     REPROJECTION,
 )
@@ -30,10 +30,21 @@ from tests.tolerances import (
 Fixture = Callable[[str], dict[str, np.ndarray]]
 
 
+@pytest.fixture(autouse=True, params=["published order", "accurate"])
+def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Both ways to solve pass all tests; `solve` takes the one of the test that runs."""
+    monkeypatch.setitem(_DEFAULTS, "accurate", request.param == "accurate")
+    return request.param
+
+
+_DEFAULTS: dict[str, bool] = {}
+
+
 def solve(world: World, poses: Tensor, patches: Tensor, t0: int, t1: int, iterations: int = 1, **options) -> BAResult:
     return fastba.BA(
-        poses, patches, world.intrinsics, world.target, world.weight, 1e-4, *world.edges, t0, t1, iterations, **options
-    )
+        poses, patches, world.intrinsics, world.target, world.weight, 1e-4, *world.edges, t0, t1, iterations,
+        **(_DEFAULTS | options)
+    )  # fmt: skip
 
 
 def tangents(new: Tensor, old: Tensor) -> Tensor:
@@ -45,21 +56,24 @@ def tangents(new: Tensor, old: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize(("case", "t0", "t1", "iterations"), [("a", 1, 8, 1), ("b", 1, 8, 2), ("c", 4, 8, 2)])
-def test_reference_steps(fixture_npz: Fixture, case: str, t0: int, t1: int, iterations: int) -> None:
+def test_reference_steps(fixture_npz: Fixture, solver: str, case: str, t0: int, t1: int, iterations: int) -> None:
     a = {key: torch.from_numpy(value) for key, value in fixture_npz("geometry").items()}
     poses, patches = a["init"].clone(), a["patches"].clone()
     result = fastba.BA(
         poses, patches, a["intrinsics"], a["target"], a["weight"], torch.tensor([1e-4]), a["ii"], a["jj"], a["kk"],
-        t0, t1, iterations,
+        t0, t1, iterations, **_DEFAULTS,
     )  # fmt: skip
     assert result.success
     assert result.iterations == iterations
     expected = a[f"fastba_{case}_patches"]
     torch.testing.assert_close(patches[:, :, :2], expected[:, :, :2], rtol=0, atol=0)
-    pose_tolerance, depth_tolerance = (BA_ONE_STEP, BA_ONE_STEP_DEPTHS) if iterations == 1 else (BA_TWO_STEPS,) * 2
-    torch.testing.assert_close(poses, a[f"fastba_{case}_poses"], rtol=0, atol=pose_tolerance)
-    error, depths = (patches - expected)[:, :, 2], expected[:, :, 2]
-    assert error.norm() <= depth_tolerance * depths.norm()
+    expected_poses = a[f"fastba_{case}_poses"]
+    if solver == "published order":
+        tolerance = BA_ONE_STEP if iterations == 1 else BA_TWO_STEPS
+        torch.testing.assert_close(poses, expected_poses, rtol=0, atol=tolerance)
+        torch.testing.assert_close(patches, expected, rtol=0, atol=tolerance)
+    assert (poses - expected_poses).norm() <= BA_ACCURATE * expected_poses.norm()
+    assert (patches - expected)[:, :, 2].norm() <= BA_ACCURATE * expected[:, :, 2].norm()
     assert torch.equal(result.patch_ids, torch.unique(a["kk"]))
     assert 0.8 < result.valid.float().mean() < 1  # the outliers of the fixture
 
@@ -76,12 +90,12 @@ def test_reference_reprojection_and_neighbors(fixture_npz: Fixture) -> None:
 # --- against an independent dense solution -----------------------------------------------------------------------
 
 
-def dense_difference(t0: int, t1: int, per_frame: bool, seed: int) -> float:
+def dense_difference(t0: int, t1: int, per_frame: bool, seed: int, **options: bool) -> float:
     world = make_world(seed, per_frame=4, jitter_intrinsics=0.05 if per_frame else 0.0)
     poses, patches = world.disturbed(0.01, 0.05, 0, seed + 50)
     dx, dz = dense_step(world, poses, patches[0, :, 2, 0, 0], list(range(t0, t1)), ep=1.0)
     new_poses, new_patches = poses.clone(), patches.clone()
-    result = solve(world, new_poses, new_patches, t0, t1, per_frame_intrinsics=per_frame)
+    result = solve(world, new_poses, new_patches, t0, t1, per_frame_intrinsics=per_frame, **options)
     assert result.success
     assert result.valid.all()
     moved = tangents(new_poses, poses)
@@ -107,7 +121,7 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faulty_source_jacobian_is_noticed(monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
     monkeypatch.setattr(normal_equations, "adjoint_matrices", FAULTS[fault])
-    assert dense_difference(1, 5, False, seed=6) > 100 * BA_DENSE_STEP
+    assert dense_difference(1, 5, False, seed=6, accurate=True) > 100 * BA_DENSE_STEP
 
 
 @pytest.mark.parametrize("row", [0, 1, 2, 3, 4, 5])
@@ -120,7 +134,7 @@ def test_faulty_target_jacobian_is_noticed(monkeypatch: pytest.MonkeyPatch, row:
         return J
 
     monkeypatch.setattr(normal_equations, "_target_jacobian", flipped)
-    assert dense_difference(1, 5, False, seed=6) > 100 * BA_DENSE_STEP
+    assert dense_difference(1, 5, False, seed=6, accurate=True) > 100 * BA_DENSE_STEP
 
 
 def test_other_image_size_is_the_only_difference() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from utils.simulator.layouts import LAYOUTS
 from utils.simulator.motion import KINDS
-from utils.simulator.renderer import Renderer, pinhole_rays
+from utils.simulator.renderer import Rays, Renderer, pinhole_rays
 from utils.simulator.textures import build_atlas, value_noise
 from utils.simulator.training import ClipBatch, ClipSettings, clip_times, plan_clip, sample_clips
 from utils.simulator.trajectory import compose, invert, quaternion_to_matrix
@@ -58,31 +58,29 @@ def test_same_generator_same_clips_whatever_the_batches(clips: ClipBatch) -> Non
 
 
 def test_ground_truth_explains_the_pictures() -> None:
-    """Pictures warped by poses and depths agree with each other far better than unwarped ones."""
+    """A surface point looks the same from both poses when the second one looks at where poses and depth put it."""
     generator = torch.Generator().manual_seed(4)
     settings = dataclasses.replace(SMALL, mean_flow_px=(3.0, 5.0))
     ratios, rng = [], np.random.default_rng(0)
-    for _ in range(3):
+    for _ in range(8):
         plan = plan_clip(4, 48, 64, generator, settings)
         rays = pinhole_rays(plan.intrinsics, 48, 64)
         poses = plan.motion.spline.poses(torch.tensor([0.5, 2.5], dtype=torch.float64))
-        # smooth textures, so that looking up between pixels costs no accuracy
+        # smooth textures, because the blur of distant texels depends on the distance
         tiles = [2 * value_noise(64, rng, coarsest=3, octaves=1) for _ in plan.tiles]
-        light, inverse = Renderer(plan.planes, build_atlas(torch.from_numpy(np.stack(tiles))), rays).render(poses)
+        atlas = build_atlas(torch.from_numpy(np.stack(tiles)))
+        light, inverse = Renderer(plan.planes, atlas, rays).render(poses)
         relative = compose(invert(poses[1:]), poses[:1])
         x, y = torch.broadcast_tensors(rays.x, rays.y)
         moved = torch.stack([x, y, torch.ones_like(x)], -1) @ quaternion_to_matrix(relative[0, 3:]).T
         moved = moved + inverse[0][..., None] * relative[0, :3]
-        fx, fy, cx, cy = plan.intrinsics
-        u, v = moved[..., 0] / moved[..., 2] * fx + cx, moved[..., 1] / moved[..., 2] * fy + cy
-        grid = torch.stack([2 * u / 63 - 1, 2 * v / 47 - 1], -1)[None]
-        warped, depth = (torch.nn.functional.grid_sample(image[1][None, None], grid, align_corners=True)[0, 0]
-                         for image in (light, inverse))
+        towards = Rays(moved[..., 0] / moved[..., 2], moved[..., 1] / moved[..., 2], rays.focal)
+        again, depth = (image[0] for image in Renderer(plan.planes, atlas, towards).render(poses[1:]))
         expected = inverse[0] / moved[..., 2]
-        seen = (grid[0].abs() < 0.97).all(-1) & ((depth - expected).abs() < 0.02 * expected)
-        assert seen.float().mean() > 0.4
-        ratios.append(float((warped - light[0])[seen].abs().mean() / (light[1] - light[0])[seen].abs().mean()))
-    assert max(ratios) < 0.15, ratios
+        seen = (depth - expected).abs() < 1e-3 * expected
+        assert seen.float().mean() > 0.8, "the rest is hidden by something nearer"
+        ratios.append(float((again - light[0])[seen].abs().mean() / (light[1] - light[0])[seen].abs().mean()))
+    assert max(ratios) < 0.05, ratios
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -98,7 +96,7 @@ def test_motion_has_the_requested_amount(kind: str) -> None:
     fixed = dataclasses.replace(settings, mean_flow_px=(2.0, 2.0))
     flows = [plan_clip(6, 48, 64, generator, fixed).motion.mean_flow_px for _ in range(6)]
     # motion that causes parallax only needs so much room that it is often cut short before a surface
-    assert np.median(flows) == pytest.approx(2.0, rel=0.5 if kind == "orbit" else 0.1)
+    assert np.median(flows) == pytest.approx(2.0, rel=0.3 if kind == "orbit" else 0.1)
     assert max(flows) < 2.3
 
 

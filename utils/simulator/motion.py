@@ -64,6 +64,8 @@ def calibrated_motion(request: MotionRequest, planes: Planes, rays: Rays, rng: n
             break
         spline = spline.scaled(0.7, 0.7)
     flow, windows = _mean_flow(spline, renderer, request.frames)
+    if flow < 0.5 * request.mean_flow_px and request.kind != "rotate":  # no room for so much translation
+        return calibrated_motion(dataclasses.replace(request, kind="rotate"), planes, rays, rng)
     return CalibratedMotion(request.kind, spline, flow, windows)
 
 

@@ -16,7 +16,7 @@ from utils.simulator.scenes import Planes
 from utils.simulator.textures import mip_levels
 from utils.simulator.trajectory import quaternion_to_matrix
 
-FILTER_TILT = 0.6
+FILTER_TILT = 0.75
 """Weight of foreshortening in the choice of the mip level: 0 looks at the distance only, 1 blurs the far axis fully."""
 
 

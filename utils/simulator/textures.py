@@ -277,5 +277,5 @@ def build_atlas(tiles: torch.Tensor) -> torch.Tensor:
 
 
 def mip_levels(size: int) -> int:
-    """Number of mip levels kept for a tile of `size` texels: down to 4 texels."""
-    return max(1, size.bit_length() - 2)
+    """Number of mip levels of a tile of `size` texels, a power of two: down to a single texel."""
+    return size.bit_length()

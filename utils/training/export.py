@@ -20,19 +20,20 @@ LIMIT_BYTES = 4 * 2**20
 
 CARD = """# {name}
 
-Event network (published architecture, `dim_inet {dim_inet}, dim_fnet {dim_fnet}, dim {dim}`, {parameters} parameters, float32), trained from
-random initialisation on simulated events only. Voxel grids of 5 bins, normalised per grid (`NORM: std`).
+Event network (published architecture, `dim_inet {dim_inet}, dim_fnet {dim_fnet}, dim {dim}`, {parameters} parameters,
+float32), trained from random initialisation on simulated events only. Voxel grids of 5 bins, normalised per grid
+(`NORM: std`).
 
 | | |
 |---|---|
-| data | `utils/simulator`: random scenes (planes, room, board, corridor), textures, motion and pixel parameters; seed {seed}; real recordings: none |
+| data | `utils/simulator`: random scenes, textures, motion and pixel parameters; seed {seed}; no real recordings |
 | optimisation | {history} |
 | hardware | {machine}, shared with other work |
 | loss weights | {losses} |
 
 ## Validation
-{clips} simulated clips of 10 frames, 160x128, seed outside the training range; identity poses and random depths at the start, 12 updates,
-errors in quarter-resolution pixels:
+{clips} simulated clips of 10 frames, 160x128, seed outside the training range; identity poses and random depths at the
+start, 12 updates, errors in quarter-resolution pixels:
 
 | figure | value | meaning |
 |---|---|---|
@@ -46,7 +47,7 @@ python -m utils.training.export runs/{run}/best.pth devo/weights/{name}.pth
 ```
 
 ## Limits
-* Trained on small images (96 to 144 pixels high) with static scenes: moving objects, rolling exposure effects and flicker were never seen.
+* Trained on small images (80 to 144 pixels high) of static scenes: moving objects and flicker were never seen.
 * Pure rotation gives no parallax; depth is then undefined, as for every monocular odometry.
 * Motion above about 12 quarter-resolution pixels between neighbouring frames lies outside the correlation windows.
 """
@@ -91,7 +92,7 @@ def export_weights(checkpoint: Path, destination: Path, history: str = "", comma
     size = sum(value.numel() * 4 for value in network.state_dict().values())
     if size > LIMIT_BYTES:
         raise OutputError(
-            f"{checkpoint} holds {size / 2**20:.1f} MiB of weights; what ships is limited to {LIMIT_BYTES / 2**20:.0f} MiB"
+            f"{checkpoint} holds {size / 2**20:.1f} MiB of weights; at most {LIMIT_BYTES / 2**20:.0f} MiB are shipped"
         )
     save_checkpoint(destination, network)
     settings = state["settings"]

@@ -84,6 +84,8 @@ def settings_from_options(options: argparse.Namespace) -> TrainSettings:
         loss=_changed(settings.loss, options.loss, "--loss"),
         augment=_changed(settings.augment, options.augment, "--augment"),
     )
+    if options.data != "sim":
+        return settings
     height, width = settings.shard_size
     if any(h > height or w > width for h, w in settings.sizes):
         raise InputError(

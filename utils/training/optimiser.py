@@ -17,7 +17,7 @@ SCHEDULES = ("cosine", "onecycle", "constant")
 
 
 def learning_rate(settings: TrainSettings, step: int) -> float:
-    """Rate at a step: linear warm-up, then `cosine` to `final_rate` of the peak, `onecycle` (linear to 0), or `constant`.
+    """Rate at a step: warm-up, then `cosine` to `final_rate` of the peak, `onecycle` (linear to 0) or `constant`.
 
     Raises:
         InputError: unknown schedule.

@@ -42,11 +42,11 @@ ShardMaker = Callable[[ShardSettings, int], TrainingClips]
 
 def write_shard(path: Path, clips: TrainingClips) -> None:
     """Store clips as float16 voxels and depths, float32 poses and intrinsics (npz, written atomically)."""
-    halves = {"voxels": clips.voxels.clamp(-6e4, 6e4).half().numpy(), "inv_depths": clips.inv_depths.half().numpy()}
     with atomic_path(path) as temporary:
         np.savez(
             temporary,
-            **halves,
+            voxels=clips.voxels.clamp(-6e4, 6e4).half().numpy(),
+            inv_depths=clips.inv_depths.half().numpy(),
             world_T_cam=clips.world_T_cam.float().numpy(),
             intrinsics=clips.intrinsics.float().numpy(),
         )
@@ -113,9 +113,9 @@ def _produce(
 class ClipPool:
     """Deterministic training batches from a sliding window of shards.
 
-    At step s the window holds the `shards` newest shards up to number `first + s*clips/(reuse*shard_clips)`; the batch is
-    drawn from it at random, augmented with a generator seeded by (seed, step). It therefore depends on the step only,
-    not on timing, and a run can be resumed exactly. Each clip is used about `reuse` times.
+    At step s the window holds the `shards` newest shards up to number `first + s*clips/(reuse*shard_clips)`; the batch
+    is drawn from it at random, augmented with a generator seeded by (seed, step). It depends on the step only, not on
+    timing, and a run can be resumed exactly. Each clip is used about `reuse` times.
 
     Args:
         folder: cache, one file per shard.

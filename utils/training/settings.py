@@ -54,8 +54,8 @@ class TrainSettings:
         perturbed: probability, per clip, to start between identity and truth (else at identity).
         solver_gradient_every, match_gradient_every: see `devo.unroll_state.UnrollSettings`.
         score_every: the scorer runs with gradient in every k-th step.
-        steps, learning_rate, warmup, schedule, clip_gradient, weight_decay, ema: optimisation; `warmup` in steps, schedule
-            onecycle (published, linear), cosine or constant.
+        steps, learning_rate, warmup, schedule, clip_gradient, weight_decay, ema: optimisation; `warmup` in steps,
+            schedule onecycle (published, linear), cosine or constant.
         precision: float32, bfloat16 or float16 (autocast of encoders and update operator).
         pool: see `utils.training.pool.ClipPool`.
         seed: of everything random.

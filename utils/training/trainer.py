@@ -294,7 +294,7 @@ def training_state(path: str | Path) -> dict[str, Any]:
 
 
 def figure_of_merit(figures: dict[str, float]) -> float:
-    """One number to compare networks by, smaller is better: flow errors at the end, at the start and alone, and poses."""
+    """One number to compare networks by, smaller is better: flow errors (last, first, alone) and positions."""
     parts = [figures["flow"], figures["last"], 0.3 * figures["first"], 0.3 * figures["probe"], 3.0 * figures["ate"]]
     return sum(parts) if all(math.isfinite(part) for part in parts) else math.inf
 

@@ -37,8 +37,8 @@ def validate(
         flow: median error after bundle adjustment over edges of neighbouring frames, quarter-resolution pixels.
         start: median true displacement before the first update. first, last: median error of the revised centres in the
         first and last update. probe: median error of single edges from a zero state, probe_ratio: median predicted over
-        median true displacement there. rotation: median degrees. ate: median over clips of the position error (rms) over
-        the path length. score: scorer loss. confidence: mean weight.
+        median true displacement there. rotation: median degrees. ate: median over clips of the position error (rms)
+        over the path length. score: scorer loss. confidence: mean weight.
     """
     was_training = network.training
     device = next(network.parameters()).device
