@@ -43,8 +43,8 @@ class Segments:
         """Cut the sorted edges into pieces of whole groups and at most `rows` edges.
 
         Returns:
-            `(first edge, last edge + 1, first group, last group + 1)` of each piece; a group larger than `rows` is a piece
-            of its own.
+            `(first edge, last edge + 1, first group, last group + 1)` of each piece; a group larger than `rows` is
+            a piece of its own.
         """
         ends = self.start.tolist()
         pieces, group = [], 0

@@ -18,11 +18,14 @@ class FeatureRing:
     def __init__(self, mem: int, patches_per_frame: int, patch_size: int, dim_inet: int, dim_fnet: int,
                  height: int, width: int, device: torch.device, dtype: torch.dtype) -> None:
         self.mem = mem
-        options = {"device": device, "dtype": dtype}
-        self.imap_ = torch.zeros(mem, patches_per_frame, dim_inet, **options)
-        self.gmap_ = torch.zeros(mem, patches_per_frame, dim_fnet, patch_size, patch_size, **options)
-        self.fmap1_ = torch.zeros(mem, height, width, dim_fnet, **options).permute(0, 3, 1, 2)[None]
-        self.fmap2_ = torch.zeros(mem, height // 4, width // 4, dim_fnet, **options).permute(0, 3, 1, 2)[None]
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(mem, *shape, device=device, dtype=dtype)
+
+        self.imap_ = zeros(patches_per_frame, dim_inet)
+        self.gmap_ = zeros(patches_per_frame, dim_fnet, patch_size, patch_size)
+        self.fmap1_ = zeros(height, width, dim_fnet).permute(0, 3, 1, 2)[None]
+        self.fmap2_ = zeros(height // 4, width // 4, dim_fnet).permute(0, 3, 1, 2)[None]
 
     def store(self, keyframe: int, fmap: Tensor, gmap: Tensor, imap: Tensor) -> None:
         """Write the features of one keyframe.

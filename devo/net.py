@@ -74,4 +74,5 @@ class VONet(nn.Module):
         from devo.unroll import unroll  # late: the tracker needs none of the training code
 
         options: dict[str, Any] = {"STEPS": STEPS, "structure_only": structure_only}
-        return unroll(self, images, poses, disps, intrinsics, patches_per_image=patches_per_image, **options)
+        network: Any = self
+        return unroll(network, images, poses, disps, intrinsics, patches_per_image=patches_per_image, **options)

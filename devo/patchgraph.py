@@ -40,7 +40,7 @@ class EdgeRecords:
 
     def select(self, mask: Tensor) -> EdgeRecords:
         """The edges where `mask` (bool `(E,)`) is set."""
-        return EdgeRecords(*(getattr(self, name)[mask] for name in _EDGE_FIELDS), newest=self.newest)
+        return EdgeRecords(self.ii[mask], self.jj[mask], self.kk[mask], self.target[mask], self.weight[mask], self.newest)
 
     def compact(self) -> EdgeRecords:
         """The same edges with int32 indices, for keeping over a long run."""

@@ -47,7 +47,7 @@ def measure(network: str, setting: str, size: str, precision: str, threads: int,
     width, height = map(int, size.split("x"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        net = load_network(NETWORKS[network])
+        net: Any = load_network(NETWORKS[network])
     cfg = Config(SETTINGS[setting] | {"KEYFRAME_THRESH": 0.0, "MIXED_PRECISION": precision != "float32"})
     tracker = DEVO(cfg, net, evs=True, ht=height, wd=width)
     if precision == "bfloat16" and tracker.dtype != torch.bfloat16:
@@ -59,7 +59,7 @@ def measure(network: str, setting: str, size: str, precision: str, threads: int,
         return hidden, (torch.zeros_like(delta), weight, rest)
 
     net.update.forward = still
-    tracker.motion_probe = lambda: float("inf")
+    tracker.motion_probe = lambda: float("inf")  # type: ignore[method-assign]
     intrinsics = torch.tensor([0.9 * width, 0.9 * width, width / 2, height / 2])
     voxel = torch.randn(5, height, width) * (torch.rand(5, height, width) < 0.2)
     steady = cfg.REMOVAL_WINDOW + cfg.PATCH_LIFETIME

@@ -116,7 +116,7 @@ def save_frame_bundle(path: str | PathLike[str], frame_data: Sequence[dict[str, 
     if target.suffix != ".npz":
         target = target.with_name(target.name + ".npz")
     with atomic_path(target) as temporary:
-        np.savez(temporary, **frames_to_arrays(frame_data))
+        np.savez(temporary, **frames_to_arrays(frame_data))  # type: ignore[arg-type]
     return target
 
 

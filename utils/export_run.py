@@ -202,7 +202,7 @@ def _save_flow(products: Products, flowdata: dict[int, dict[str, Any]]) -> Path:
     arrays = {f"{frame}_{key}": np.asarray(value) for frame, entry in flowdata.items()
               for key, value in entry.items() if key != "img"}
     with atomic_path(products.path("_flow.npz")) as temporary:
-        np.savez_compressed(temporary, **arrays)
+        np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
     return products.path("_flow.npz")
 
 

@@ -43,9 +43,9 @@ class MapRecorder:
         if self.frame_folder is None or not tracker.is_initialized:
             return
         points = tracker.world_points()
-        points = points[torch.isfinite(points).all(dim=1)].cpu().numpy()
+        finite = points[torch.isfinite(points).all(dim=1)]
         path = self.frame_folder / f"cloud_{tracker.counter:05d}.ply"
-        write_cloud(path, PointCloud(points))
+        write_cloud(path, PointCloud(finite.cpu().numpy()))
         self.written.append(path)
 
     def on_end(self, tracker: DEVO) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from devo.altcorr.correlation import corr, draw_kept_edges
 from devo.altcorr.volumes import Volume, look_up, volume_shape
+from devo.altcorr.windows import check_edges
 from devo.errors import InputError
 
 MAX_VOLUME_BYTES = 1 << 31
@@ -85,10 +86,7 @@ class CorrBlock:
         Raises:
             InputError: shapes do not fit together, or an edge leaves its clip or the sample.
         """
-        patch = self.gmap.shape[-1]
-        if ii.shape != jj.shape or ii.dim() != 1 or coords.shape != (1, len(ii), 2, patch, patch):
-            found = f"coords {tuple(coords.shape)}, ii {tuple(ii.shape)}, jj {tuple(jj.shape)}"
-            raise InputError(f"CorrBlock got {found}; expected (1, E, 2, {patch}, {patch}), (E,) and (E,)")
+        check_edges("CorrBlock", coords, ii, jj, self.gmap.shape[-1])
         coords = coords.detach()
         if self.volumes is None:
             return self._by_corr(ii, jj, coords)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devo.altcorr.windows import blend, pixel_rows, split_coords, spread, window_rows
+from devo.altcorr.windows import blend, check_edges, pixel_rows, split_coords, spread, window_rows
 from devo.errors import InputError
 from devo.kernels import cuda_kernel
 
@@ -78,9 +78,7 @@ def _check(fmap1: Tensor, fmap2: Tensor, coords: Tensor, ii: Tensor, jj: Tensor,
     if fmap1.shape[2] != fmap2.shape[2] or fmap1.dtype != fmap2.dtype:
         found = f"{fmap1.shape[2]} x {fmap1.dtype} and {fmap2.shape[2]} x {fmap2.dtype}"
         raise InputError(f"corr got patch and map features of {found}; expected the same channels and dtype")
-    if ii.shape != jj.shape or ii.dim() != 1 or coords.shape != (1, len(ii), 2, patch, patch):
-        found = f"coords {tuple(coords.shape)}, ii {tuple(ii.shape)}, jj {tuple(jj.shape)}"
-        raise InputError(f"corr got {found}; expected (1, E, 2, {patch}, {patch}), (E,) and (E,)")
+    check_edges("corr", coords, ii, jj, patch)
     if radius < 0 or not 0 <= dropout <= 1:
         raise InputError(f"corr got radius={radius}, dropout={dropout}; expected radius >= 0 and 0 <= dropout <= 1")
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from devo.altcorr.correlation import corr
-from devo.altcorr.windows import split_coords
+from devo.altcorr.windows import check_edges, split_coords
 from devo.errors import InputError
 
 CHUNK_BYTES = 1 << 23
@@ -52,9 +52,10 @@ def corr_features(
     if not levels or any(level.dtype != gmap.dtype or level.shape[:3] != pyramid[0].shape[:3] for level in pyramid):
         found = ", ".join(f"{tuple(level.shape)} {level.dtype}" for level in pyramid) or "nothing"
         raise InputError(f"corr_features got the pyramid {found}; expected equal frames, channels and {gmap.dtype}")
+    check_edges("corr_features", coords, kk, jj, patch)
     out = gmap.new_empty(edges, side, side, patch * patch, levels)
     with torch.no_grad(), torch.autocast(gmap.device.type, enabled=False):
-        if gmap.is_cuda:
+        if gmap.device.type != "cpu":
             _by_corr(out, gmap, pyramid, coords, kk, jj, radius)
         elif edges:
             _by_shared_windows(out, gmap, pyramid, coords, kk, jj, radius)

@@ -30,9 +30,10 @@ def patchify(net: Tensor, coords: Tensor, radius: int, mode: str = "bilinear") -
     Raises:
         InputError: shapes do not fit together.
     """
-    if net.dim() != 4 or coords.dim() != 3 or coords.shape[::2] != (net.shape[0], 2) or radius < 0:
-        found = f"net {tuple(net.shape)}, coords {tuple(coords.shape)}, radius {radius}"
-        raise InputError(f"patchify got {found}; expected (B, C, H, W), (B, M, 2) and radius >= 0")
+    precise = coords.dtype in (torch.float32, torch.float64)
+    if not precise or net.dim() != 4 or coords.dim() != 3 or coords.shape[::2] != (net.shape[0], 2) or radius < 0:
+        found = f"net {tuple(net.shape)}, coords {tuple(coords.shape)} {coords.dtype}, radius {radius}"
+        raise InputError(f"patchify got {found}; expected (B, C, H, W), (B, M, 2) float32 and radius >= 0")
     extension = cuda_kernel("altcorr", net, coords)
     if extension is not None:
         return extension.patchify(net, coords, radius, mode)

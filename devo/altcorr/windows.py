@@ -9,8 +9,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from devo.errors import InputError
+
 FAR = 1 << 20
 """Integer pixel that stands for 'outside of every map'; larger, infinite and NaN coordinates are clamped to it."""
+
+
+def check_edges(caller: str, coords: Tensor, kk: Tensor, jj: Tensor, patch: int) -> None:
+    """Raise `InputError` unless positions (1, E, 2, P, P) float32 or float64 and the edge lists (E,) fit together."""
+    precise = coords.dtype in (torch.float32, torch.float64)
+    if not precise or kk.dim() != 1 or kk.shape != jj.shape or coords.shape != (1, len(kk), 2, patch, patch):
+        found = f"coords {tuple(coords.shape)} {coords.dtype} for edges {tuple(kk.shape)} and {tuple(jj.shape)}"
+        raise InputError(f"{caller} got {found}; expected (1, E, 2, {patch}, {patch}) float32, (E,) and (E,)")
 
 
 def split_coords(coords: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,16 +77,16 @@ def blend(window: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
 
 
 def spread(grad: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
-    """Transpose of `blend`: distribute (..., D-1, D-1) gradients over the (..., D, D) window."""
-    dx, dy = dx[..., None, None], dy[..., None, None]
+    """Transpose of `blend`: distribute (N, D-1, D-1) gradients over the (N, D, D) window, given (N,) fractions."""
     side = grad.shape[-1] + 1
-    rows = grad.new_zeros(*grad.shape[:-2], side, side - 1)
-    rows[..., :-1, :] = grad * (1 - dy)
-    rows[..., 1:, :] += grad * dy
-    window = grad.new_zeros(*grad.shape[:-2], side, side)
-    window[..., :-1] = rows * (1 - dx)
-    window[..., 1:] += rows * dx
-    return window
+    # flattened, with a zero behind every row and a zero row at the end, the neighbours are found by shifting
+    padded = torch.nn.functional.pad(grad, (0, 1, 0, 1)).flatten(1)
+    dx, dy = dx[:, None], dy[:, None]
+    rows = padded * (1 - dy)
+    rows[:, side:].addcmul_(padded[:, :-side], dy)
+    window = rows * (1 - dx)
+    window[:, 1:].addcmul_(rows[:, :-1], dx)
+    return window.view(-1, side, side)
 
 
 def pixel_rows(maps: Tensor) -> Tensor:

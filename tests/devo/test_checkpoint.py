@@ -66,7 +66,7 @@ def test_published_layouts(tmp_path: Path, network: nn.Module, layout: str, mode
     content = {
         "wrapped": {"steps": 10, "model_state_dict": state, "optimizer_state_dict": {}, "scheduler_state_dict": {}},
         "flat": state,
-        "prefixed": {**{f"module.{name}": value for name, value in state.items()}, "module.update.lmbda": torch.ones(1)},
+        "prefixed": {"module.update.lmbda": torch.ones(1)} | {f"module.{name}": state[name] for name in state},
         "half": {name: value.bfloat16() for name, value in state.items()},
     }[layout]
     file = tmp_path / "weights.pth"
@@ -97,7 +97,8 @@ def test_published_training_checkpoint_with_scheduler_objects(tmp_path: Path, ne
 
 
 @pytest.mark.parametrize(
-    "kind, channels, selector", [(eVONet, 5, "scorer"), (eVONet, 5, "gradient"), (VONet, 3, "random"), (VONet, 3, "gradient")]
+    "kind, channels, selector",
+    [(eVONet, 5, "scorer"), (eVONet, 5, "gradient"), (VONet, 3, "random"), (VONet, 3, "gradient")],
 )
 @pytest.mark.parametrize("patch_size", [1, 3, 5])
 def test_kind_and_sizes_are_inferred(tmp_path: Path, kind, channels: int, selector: str, patch_size: int) -> None:
@@ -113,7 +114,8 @@ def test_selector_rules(tmp_path: Path, network: nn.Module) -> None:
     with_scorer = save_checkpoint(tmp_path / "with.pth", network)
     without = save_checkpoint(tmp_path / "without.pth", quiet(f"random:0:{SMALL}", patch_selector="random"))
     frames = save_checkpoint(tmp_path / "frames.pth", quiet(f"random:0:{SMALL}:rgb"))
-    assert [load_network(file).patch_selector for file in (with_scorer, without, frames)] == ["scorer", "gradient", "random"]
+    chosen = [load_network(file).patch_selector for file in (with_scorer, without, frames)]
+    assert chosen == ["scorer", "gradient", "random"]
     dropped = load_network(with_scorer, patch_selector="gradient")
     assert not any("scorer" in name for name in dropped.state_dict())
     for file in (without, frames):
@@ -201,7 +203,8 @@ def test_truncated_file(tmp_path: Path, network: nn.Module, modern: bool, kept: 
 
 
 @pytest.mark.parametrize(
-    "content", [b"hello world, these are no weights\n" * 9, bytes(range(256)) * 40, b"PK\x03\x04" + bytes(90), b"\x80\x02]q\x00."]
+    "content",
+    [b"hello world, these are no weights\n" * 9, bytes(range(256)) * 40, b"PK\x03\x04" + bytes(90), b"\x80\x02]q\x00."],
 )
 def test_garbage(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "weights.pth"
@@ -233,11 +236,14 @@ def test_missing_empty_and_folder(tmp_path: Path) -> None:
         (lambda s: s.update({"update.norm.bias": torch.ones(7)}), r"update\.norm\.bias \(7,\) instead of \(16,\)"),
         (lambda s: [s.pop(name) for name in list(s) if "gru" in name], "missing: .* and 12 more"),
         (lambda s: s.pop("patchify.fnet.conv1.weight"), "no odometry network"),
-        (lambda s: s.update({"patchify.fnet.conv1.weight": torch.ones(4, 1, 7, 7)}), "1 input channels; expected 5 .* or 3"),
+        (lambda s: s.update({"patchify.fnet.conv1.weight": torch.ones(4, 1, 7, 7)}), "1 input channels; expected 5"),
         (lambda s: s.update({"update.corr.0.weight": torch.ones(16, 883)}), "883 correlation features"),
         (lambda s: s.update({"update.corr.0.weight": torch.ones(16, 98 * 4)}), "392 correlation features"),
         (lambda s: s.update({"patchify.inet.conv2.weight": torch.ones(20, 8, 1, 1)}), "of wrong shape: .*conv2.bias"),
-        (lambda s: s.update({"update.norm.bias": torch.full((16,), float("nan"))}), r"NaN or infinite weights in update\.norm\.bias"),
+        (
+            lambda s: s.update({"update.norm.bias": torch.full((16,), float("nan"))}),
+            "NaN or infinite weights in update.norm",
+        ),
         (lambda s: s.update({"update.norm.bias": torch.full((16,), float("inf"))}), "NaN or infinite"),
         (lambda s: s.update({"update.norm.bias": torch.ones(16, dtype=torch.int64)}), "int64"),
         (lambda s: s.update({"update.norm.bias": 3.0}), "no tensor"),
@@ -269,9 +275,9 @@ def test_random_networks_repeat_by_seed() -> None:
     assert quiet("random:1:rgb").dim_inet == 384
 
 
-@pytest.mark.parametrize("name", ["random:", "random:x", "random:-1", "random:0:1,2", "random:0:0,8,4", "random:0:1,2,3:bgr"])
+@pytest.mark.parametrize("name", ["", "x", "-1", "0:1,2", "0:0,8,4", "0:1,2,3:bgr", "rgb"])
 def test_bad_random_names(name: str) -> None:
-    expect_one_line(name, "expected random:SEED")
+    expect_one_line(f"random:{name}", "expected random:SEED")
 
 
 def test_builtin_names(tmp_path: Path, network: nn.Module, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,7 +302,8 @@ def test_shipped_weights_load() -> None:
 
 def test_save_reads_back_with_extras(tmp_path: Path, network: nn.Module) -> None:
     optimizer = torch.optim.AdamW(network.parameters())
-    file = save_checkpoint(tmp_path / "deep" / "weights.pth", network, steps=4, optimizer_state_dict=optimizer.state_dict())
+    extras = {"steps": 4, "optimizer_state_dict": optimizer.state_dict()}
+    file = save_checkpoint(tmp_path / "deep" / "weights.pth", network, **extras)
     content = torch.load(file, weights_only=True)
     assert list(content) == ["model_state_dict", "steps", "optimizer_state_dict"] and content["steps"] == 4
     assert list(read_state_dict(file)) == list(network.state_dict())

@@ -363,7 +363,7 @@ def test_bad_numbers_do_not_spread(what: str) -> None:
     keep = ~bad
     fastba.BA(
         clean_poses, clean_patches, world.intrinsics, world.target[:, keep], world.weight[:, keep], 1e-4,
-        world.ii[keep], world.jj[keep], world.kk[keep], 1, 5, iterations,
+        world.ii[keep], world.jj[keep], world.kk[keep], 1, 5, iterations, **_DEFAULTS,
     )  # fmt: skip
     if what != "behind":
         torch.testing.assert_close(new_poses, clean_poses, rtol=0, atol=1e-12, equal_nan=True)

@@ -73,7 +73,7 @@ def test_std_statistics(seed: int, density: float, scale: float, offset: float) 
 
 
 def test_sequence_statistics_are_per_voxel_or_per_clip() -> None:
-    clips = torch.stack([sparse(3, 5, 12, 16, seed=seed) for seed in (1, 2)]) * torch.tensor([1.0, 100.0]).view(2, 1, 1, 1, 1)
+    clips = torch.stack([scale * sparse(3, 5, 12, 16, seed=seed) for seed, scale in ((1, 1.0), (2, 100.0))])
     per_voxel = normalize_sequence(clips, "std")
     per_clip = normalize_sequence(clips, "std2")
     scaled = normalize_sequence(clips, "rescale")

@@ -190,8 +190,10 @@ def test_edge_groups(edges: int, frames: int, seed: int) -> None:
         for rows in (1, 5, 1000):
             pieces = segments.chunks(rows)
             assert [piece[0] for piece in pieces] + [edges] == [0] + [piece[1] for piece in pieces]
-            assert all(last - first <= rows or groups_in == 1 for first, last, groups_in in
-                       ((a, b, d - c) for a, b, c, d in pieces))
+            assert all(
+                last - first <= rows or groups_in == 1
+                for first, last, groups_in in ((a, b, d - c) for a, b, c, d in pieces)
+            )
     previous, following = groups.neighbours
     expected = neighbors(kk, jj)
     assert torch.equal(previous, expected[0]) and torch.equal(following, expected[1])
