@@ -56,6 +56,34 @@ def direct_loss(predicted: Tensor, coords_gt: Tensor, valid: Tensor, limit: floa
     return masked_mean((predicted - coords_gt).norm(dim=-1).clamp(max=limit), valid)
 
 
+def fine_loss(predicted: Tensor, coords_gt: Tensor, valid: Tensor, scale: float = 0.2) -> Tensor:
+    """Mean of ln(1 + error/scale): rewards precision, where `direct_loss` is dominated by the edges that are far off.
+
+    Args:
+        predicted, coords_gt: (1,E,2) quarter-resolution pixels.
+        valid: (1,E) bool.
+        scale: pixels.
+    """
+    return masked_mean(torch.log1p((predicted - coords_gt).norm(dim=-1) / scale), valid)
+
+
+def confidence_loss(
+    weights: Tensor, predicted: Tensor, coords_gt: Tensor, valid: Tensor, scale: float = 0.2, limit: float = 2.0
+) -> Tensor:
+    """Gaussian negative log likelihood of the errors, per axis, with variance scale^2 / weight.
+
+    Makes the confidence what bundle adjustment takes it for, an inverse variance: smallest at scale^2 / error^2. Errors
+    get no gradient; they are limited to `limit` pixels, which is also the error of edges that are not valid (hidden).
+
+    Args:
+        weights: (1,E,2) in (0,1).
+        predicted, coords_gt: (1,E,2) quarter-resolution pixels.
+        valid: (1,E) bool.
+    """
+    error = torch.where(valid[..., None], (predicted.detach() - coords_gt).abs().clamp(max=limit), limit)
+    return 0.5 * (weights * (error / scale).square() - weights.clamp(min=1e-6).log()).mean()
+
+
 def alignment_scale(centres_gt: Tensor, centres: Tensor, limit: float = MAX_SCALE) -> Tensor:
     """Scale that brings predicted camera centres to the size of the true ones (Umeyama 1991, without sign correction).
 

@@ -35,7 +35,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
     add("--background", action="store_true", help="put a slanted textured plane behind the board")
     add("--threshold", type=float, default=0.22, help="contrast threshold in log intensity")
     add("--noise", choices=("none", "typical", "strong"), default="typical", help="noise of the pixels")
-    add("--device", default="cpu", help="where to render: cpu, cuda or cuda:0")
+    add("--device", default="auto", help="where to render: auto, cpu, cuda or cuda:0")
     add("--overwrite", action="store_true", help="replace an older simulated recording")
     return parser
 
@@ -45,9 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = build_arg_parser().parse_args(argv)
     import torch
 
+    from devo.device import resolve_device
     from utils.simulator.camera import parse_size
     from utils.simulator.dataset_folder import FolderOptions, write_recording
-    from utils.simulator.device import checked_device
     from utils.simulator.sequence import SequenceSettings
 
     torch.set_num_threads(1)  # drawing and pixels run side by side; more threads would only wait for each other
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         scene=args.scene, seconds=args.seconds, seed=args.seed, preset=args.preset, size=parse_size(args.size),
         distorted=args.distortion, background=args.background, threshold=args.threshold, noise=args.noise)
     options = FolderOptions(args.fps, args.frames, args.depth, args.overwrite, progress=True)
-    summary = write_recording(args.out, settings, options, checked_device(args.device))
+    summary = write_recording(args.out, settings, options, resolve_device(args.device))
     print(f"{summary.folder}: {summary.events} events in {summary.seconds:g} s "
           f"({summary.events_per_s / 1e3:.0f} thousand a second), path {summary.path_length_m:.2f} m, "
           f"image motion {summary.mean_flow_px_s:.0f} px/s, {summary.frames} stamps")

@@ -23,6 +23,13 @@ BA_CLIPS = 1e-4  # float32, joined against separate clips
 BA_DENSE_STEP = 1e-7  # float64, against a dense system with numeric Jacobian
 
 # --- correlation --------------------------------------------------------------------------------------------
+CORRELATION_PARITY = 1e-5  # altcorr.npz, values up to 20; observed 2.4e-6
+CORRELATION_GRADIENT = 1e-5  # of the largest entry
+PATCHIFY_PARITY = 1e-5  # altcorr.npz, values and gradient; observed 2.4e-7
+CORRELATION_CLOSED_FORM = 1e-12  # float64, against the bilinear sampler of torch
+CORRELATION_FEATURES = 1e-5  # shared windows against corr, float32, values up to 30
+CORRELATION_BLOCK = 1e-5  # volumes against corr, values and gradients, of the largest value
+CORRELATION_HALF = 0.02  # float16 and bfloat16 against float32, of the largest value
 
 # --- networks -----------------------------------------------------------------------------------------------
 NETWORK_PARITY = 1e-4  # network_small.npz, values up to 5; observed 2.4e-6 (maps), 2.0e-6 (update)
@@ -47,10 +54,10 @@ RECTIFY_ROUND_TRIP_FISHEYE = 5e-5  # pixels; worst 1.45e-5, float32 map of +-700
 UMEYAMA_AGAINST_EVO = 1e-9  # 100 random pairs, rotation, translation and scale: worst 2.2e-14
 
 # --- simulator ----------------------------------------------------------------------------------------------
-SIMULATOR_DEPTH = 1e-5
-SIMULATOR_SURFACE = 1e-4
-SIMULATOR_CROSSING_TIME = 2e-4
-SIMULATOR_VOXEL = 1e-3
+SIMULATOR_DEPTH = 2e-6  # inverse depth against float64 ray casting, relative to the largest; observed 2.2e-7
+SIMULATOR_SURFACE = 3e-6  # back-projected depth, distance from the scene over that from the camera; observed 2.8e-7
+SIMULATOR_CROSSING = 1e-5  # log intensity at the time of an event against a float64 pixel; observed 1.7e-6
+SIMULATOR_VOXEL = 1e-5  # voxel cells against float64 binning of listed events; observed 1.4e-6
 
 # --- training -----------------------------------------------------------------------------------------------
 CORRELATION_VOLUME = 1e-4  # volume against direct correlation, values up to 40 and gradients; observed 1e-5

@@ -100,7 +100,7 @@ class CorrBlock:
             keep = draw_kept_edges(len(ii), self.dropout, coords.device, self.generator)
         positions = coords[0].flatten(2)
         features = look_up(self.volumes, self.levels, positions, ii, jj, keep, self.dtype)
-        return features.view(1, len(ii), -1)
+        return features.flatten(1)[None]
 
     def _by_corr(self, ii: Tensor, jj: Tensor, coords: Tensor) -> Tensor:
         levels = [

@@ -106,8 +106,10 @@ class _Corr(torch.autograd.Function):
         for first in range(0, len(ii), chunk):
             part = slice(first, first + chunk)
             window = _Windows(coords[0, part], jj[part], fmap2, radius)
-            products = torch.bmm(window.gather(pixels), patches[ii[part]].reshape(-1, fmap1.shape[2], 1))
-            volume = products.squeeze(-1).masked_fill_(~window.inside, 0).unflatten(1, (side + 1, side + 1))
+            features = patches[ii[part]].reshape(-1, 1, fmap1.shape[2])
+            # (1, C) x (C, D*D): unlike its transpose, this product does not depend on the size of the chunk
+            products = torch.bmm(features, window.gather(pixels).transpose(1, 2)).squeeze(1)
+            volume = products.masked_fill_(~window.inside, 0).unflatten(1, (side + 1, side + 1))
             blended = blend(volume, window.dx, window.dy).unflatten(0, (-1, patch, patch))
             out[part] = blended.permute(0, 4, 3, 1, 2)
         return out[None]

@@ -59,7 +59,7 @@ def corr_features(
             _by_corr(out, gmap, pyramid, coords, kk, jj, radius)
         elif edges:
             _by_shared_windows(out, gmap, pyramid, coords, kk, jj, radius)
-    return out.view(1, edges, -1)
+    return out.flatten(1)[None]
 
 
 def _by_corr(

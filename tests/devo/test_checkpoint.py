@@ -327,6 +327,29 @@ def test_failed_save_keeps_the_old_file(tmp_path: Path, network: nn.Module) -> N
     assert [path.name for path in tmp_path.iterdir()] == ["weights.pth"]
 
 
+def test_target_only_ever_appears_complete(tmp_path: Path, network: nn.Module, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything is written elsewhere first; a full disk leaves the old file and no debris."""
+    file = save_checkpoint(tmp_path / "weights.pth", network)
+    before, real_save, written = file.read_bytes(), torch.save, []
+
+    def spying_save(content: object, target: Path, **options: object) -> None:
+        written.append(Path(target))
+        real_save(content, target, **options)
+
+    def full_disk(content: object, target: Path, **options: object) -> None:
+        Path(target).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", spying_save)
+    save_checkpoint(file, network)
+    assert written and file not in written and all(path.parent == tmp_path for path in written)
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        save_checkpoint(file, network)
+    assert file.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["weights.pth"]
+
+
 def test_encoders_must_be_finite_and_known() -> None:
     network = quiet(f"random:0:{SMALL}:rgb")
     arrays = {

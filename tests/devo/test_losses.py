@@ -8,7 +8,17 @@ import pytest
 import torch
 
 from devo.lietorch import SE3
-from devo.losses import alignment_scale, direct_loss, flow_loss, masked_mean, pose_errors, pose_loss, score_loss
+from devo.losses import (
+    alignment_scale,
+    confidence_loss,
+    direct_loss,
+    fine_loss,
+    flow_loss,
+    masked_mean,
+    pose_errors,
+    pose_loss,
+    score_loss,
+)
 
 
 def random_poses(clips: int, frames: int, seed: int) -> torch.Tensor:
@@ -102,3 +112,22 @@ def test_score_loss_by_hand_and_only_scores_learn() -> None:
     assert weights.grad is None
     assert scores.grad is not None
     assert scores.grad[0].tolist() == pytest.approx([1.0 - 1.0, 1.0 - 2.0])
+
+
+def test_confidence_loss_is_smallest_at_the_inverse_variance() -> None:
+    error = torch.tensor([[[0.4, 0.8]]])
+    weights = torch.tensor([[[0.25, 0.0625]]], requires_grad=True)  # 0.2^2 / error^2
+    valid = torch.ones(1, 1, dtype=torch.bool)
+    (gradient,) = torch.autograd.grad(confidence_loss(weights, error, torch.zeros(1, 1, 2), valid), weights)
+    assert gradient.abs().max() < 1e-5
+    hidden = confidence_loss(weights, error, error, ~valid)
+    far = confidence_loss(weights, error + 99, error, valid)
+    assert hidden.item() == far.item()
+
+
+def test_fine_loss_weighs_relative_precision() -> None:
+    errors = torch.tensor([[[0.2, 0.0], [0.0, 0.6]]], requires_grad=True)
+    loss = fine_loss(errors, torch.zeros(1, 2, 2), torch.ones(1, 2, dtype=torch.bool))
+    assert loss.item() == pytest.approx((math.log(2) + math.log(4)) / 2)
+    (gradient,) = torch.autograd.grad(loss, errors)
+    assert gradient.abs().sum(-1)[0].tolist() == pytest.approx([1.25, 0.625])

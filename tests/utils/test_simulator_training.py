@@ -128,3 +128,12 @@ def test_other_bank_other_textures() -> None:
     same = draw(1)
     assert torch.equal(changed.inv_depths, same.inv_depths), "geometry does not depend on the bank"
     assert not torch.equal(changed.voxels, same.voxels)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_clips_on_a_gpu_agree_with_the_cpu(clips: ClipBatch) -> None:
+    on_gpu = sample_clips(4, 4, 48, 64, generator=torch.Generator().manual_seed(0), settings=SMALL, device="cuda")
+    torch.testing.assert_close(on_gpu.inv_depths.cpu(), clips.inv_depths, atol=1e-4, rtol=1e-4)
+    difference = (on_gpu.voxels.cpu() - clips.voxels).abs().sum() / clips.voxels.abs().sum()
+    assert difference < 0.01, "rounding may move a few events by a threshold"

@@ -111,8 +111,8 @@ class PixelArray:
         count, spacing = crossings.count, crossings.spacing
         dead = self.refractory_us / torch.as_tensor(duration_us, device=count.device).clamp(min=1e-9)
         waiting = (dead - self._since_us / duration_us - crossings.first).clamp_(min=0)
-        skipped = (waiting / spacing - 1e-4).ceil_().clamp_(min=0)
-        stride = (dead / spacing - 1e-4).ceil_().clamp_(min=1)
+        skipped = (waiting / spacing - 1e-5).ceil_().clamp_(min=0)
+        stride = (dead / spacing - 1e-5).ceil_().clamp_(min=1)
         kept = ((count - skipped) / stride).ceil_().clamp_(min=0)
         first = torch.addcmul(crossings.first, skipped, spacing)
         spacing = spacing * stride

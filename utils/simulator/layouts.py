@@ -18,7 +18,7 @@ class PlaneList:
     focal: float
     tile: int
     rng: np.random.Generator
-    sharpness: tuple[float, float] = (0.28, 1.0)
+    sharpness: tuple[float, float] = (0.18, 0.9)
     rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]] = dataclasses.field(
         default_factory=list)
     names: list[str] = dataclasses.field(default_factory=list)

@@ -25,8 +25,9 @@ class LossSettings:
         direct: per update, error of the revised centres before bundle adjustment.
         direct_first: factor on `direct` for the first update, which the tracker's start-up depends on.
         probe: error of one update on stand-alone edges from a zero state.
-        confidence: cross entropy between the confidence and exp(-(error / `confidence_pixels`)^2) before bundle
-            adjustment; gives the weights a meaning before the solver's gradients do.
+        fine: per update, ln(1 + error/0.2 px) of the same revised centres.
+        confidence: per update, likelihood of these errors under the predicted confidence; gives the weights a meaning
+            before the solver's gradients do.
         published_from: step from which flow and pose losses count in full; they are ramped up linearly over the
             same number of steps before.
     """
@@ -37,8 +38,8 @@ class LossSettings:
     direct: float = 0.3
     direct_first: float = 2.0
     probe: float = 0.6
+    fine: float = 0.0
     confidence: float = 0.0
-    confidence_pixels: float = 0.5
     published_from: int = 0
 
 

@@ -5,13 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from devo.data_readers.base import TrainingClips
 from devo.enet import eVONet
 from devo.lietorch import SE3
-from devo.losses import direct_loss, flow_errors, flow_loss, masked_mean, pose_loss, score_loss
+from devo.losses import (
+    confidence_loss,
+    direct_loss,
+    fine_loss,
+    flow_errors,
+    flow_loss,
+    masked_mean,
+    pose_loss,
+    score_loss,
+)
 from devo.unroll import UnrollResult, UnrollStep, unroll_clips
 from devo.unroll_state import UnrollSettings
 from utils.training.settings import LossSettings, TrainSettings
@@ -86,16 +94,19 @@ class TrainingStep(nn.Module):
 
 def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> dict[str, Tensor]:
     """Weighted sum of all losses of an unrolled batch, see `LossSettings`; parts are means over the updates."""
-    parts: dict[str, list[Tensor]] = {name: [] for name in ("flow", "pose", "direct", "confidence")}
+    parts: dict[str, list[Tensor]] = {name: [] for name in ("flow", "pose", "direct", "fine", "confidence")}
     total = result.steps[0].predicted.new_zeros(())
     for number, step in enumerate(result.steps):
         direct = direct_loss(step.predicted, step.predicted_gt, step.predicted_valid)
         total = total + weights.direct * (weights.direct_first if number == 0 else 1.0) * direct
         parts["direct"].append(direct)
-        if weights.confidence > 0:
-            confidence = confidence_loss(step, weights.confidence_pixels)
-            total = total + weights.confidence * confidence
-            parts["confidence"].append(confidence)
+        seen = step.predicted, step.predicted_gt, step.predicted_valid
+        for name, weight, loss in (
+            ("fine", weights.fine, fine_loss(*seen)),
+            ("confidence", weights.confidence, confidence_loss(step.weight, *seen)),
+        ):
+            total = total + weight * loss
+            parts[name].append(loss)
         if step.coords is None or plan.published_weight == 0:
             continue
         flow = flow_loss(step.coords, step.coords_gt, step.valid)
@@ -122,14 +133,6 @@ def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> d
     if parts["flow"]:
         report["flow_last"] = parts["flow"][-1].detach()
     return {"total": total, **report}
-
-
-def confidence_loss(step: UnrollStep, pixels: float) -> Tensor:
-    """Cross entropy between the confidence and exp(-(error/pixels)^2) of the centres before bundle adjustment."""
-    error = (step.predicted.detach() - step.predicted_gt).abs()
-    wanted = torch.exp(-(error / pixels).square())
-    wanted = torch.where(step.predicted_valid[..., None], wanted, 0.0)
-    return F.binary_cross_entropy(step.weight.clamp(1e-6, 1 - 1e-6), wanted, reduction="mean")
 
 
 def last_score_loss(step: UnrollStep) -> Tensor | None:

@@ -45,6 +45,7 @@ LOG_NAMES = (
     "flow_last",
     "pose",
     "scores",
+    "fine",
     "confidence",
 )
 FAILED_IN_A_ROW = 50
