@@ -42,6 +42,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         ("initial-frames", int),
         ("structure-only", float),
         ("perturbed", float),
+        ("flat-depth", float),
         ("solver-gradient-every", int),
         ("match-gradient-every", int),
         ("score-every", int),

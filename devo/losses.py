@@ -133,13 +133,34 @@ def pose_errors(cam_T_world: Tensor, cam_T_world_gt: Tensor) -> tuple[Tensor, Te
     return error[..., :3].norm(dim=-1), error[..., 3:].norm(dim=-1)
 
 
-def pose_loss(cam_T_world: Tensor, cam_T_world_gt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def same_direction(cam_T_world: Tensor, cam_T_world_gt: Tensor) -> Tensor:
+    """Clips (B,) bool whose predicted camera path does not run against the true one.
+
+    Scenes with little relief have a second solution with depth and motion inverted. A clip that sits there cannot learn
+    from its poses: small changes do not bring it back.
+    """
+    from devo.lietorch import SE3
+
+    with torch.no_grad():
+        paths = [SE3(poses).inv().data[..., :3] for poses in (cam_T_world, cam_T_world_gt)]
+        est, gt = (path - path[:, :1] for path in paths)
+        return (est * gt).sum(dim=(1, 2)) >= 0
+
+
+def pose_loss(cam_T_world: Tensor, cam_T_world_gt: Tensor, used: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Mean translation error plus mean rotation error of all ordered frame pairs, see `pose_errors`.
+
+    Args:
+        cam_T_world, cam_T_world_gt: (B,N,7) world -> camera.
+        used: (B,) bool, clips that count; default all.
 
     Returns:
         (sum, translation part, rotation part), scalars.
     """
     translation, rotation = pose_errors(cam_T_world, cam_T_world_gt)
+    if used is not None:
+        mask = used[:, None].expand_as(translation)
+        translation, rotation = masked_mean(translation, mask), masked_mean(rotation, mask)
     return translation.mean() + rotation.mean(), translation.mean(), rotation.mean()
 
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from devo.enet import eVONet
     from devo.lietorch import SE3
 
+FLAT_INV_DEPTH = 0.5
+FLAT_SPREAD = 0.5  # standard deviation, in octaves
 DEPTH_TOLERANCE = 0.15  # relative excess of inverse depth beyond which a point counts as hidden behind another
 
 
@@ -30,6 +32,8 @@ class UnrollSettings:
         structure_only: poses start at the truth and stay; only inverse depths are solved.
         initial_frames: frames of the dense first graph; it also is the number of updates before the graph grows.
         drop_probability: chance, per growth step, to delete all edges of the frame four before the new one.
+        flat_depth: chance, per clip, to start with equal inverse depths for all patches (about `FLAT_INV_DEPTH`, as the
+            tracker does) instead of values drawn from U(0,1). Random depths often lead to the mirrored solution.
         flow_radius, score_radius: largest frame distance of the edges reported for the flow and the scorer loss.
         solver_iterations: Gauss-Newton steps per update.
         solver_gradient_every: 1: gradients flow through every bundle adjustment; k: through every k-th (and the last),
@@ -44,6 +48,7 @@ class UnrollSettings:
     structure_only: bool = False
     initial_frames: int = 8
     drop_probability: float = 0.1
+    flat_depth: float = 0.0
     flow_radius: int = 2
     score_radius: int = 16
     solver_iterations: int = 2
@@ -75,7 +80,7 @@ class JoinedClips:
         self.scores: Tensor | None = rest[0] if rest else None
         self.height, self.width = fmap.shape[-2:]
         self.patches_gt = patches.detach().float()
-        self.patches = self._with_depth(torch.rand_like(self.patches_gt[:, :, :1, :1, :1]))
+        self.patches = self._with_depth(self._start_depth())
         fmap = fmap.float().reshape(1, flat, *fmap.shape[2:])
         self.correlate = CorrelationVolume(
             fmap, gmap.float(), self.clips, dtype=settings.mixed_precision or torch.float32
@@ -95,6 +100,14 @@ class JoinedClips:
             return contextlib.nullcontext()
         device = next(self.network.parameters()).device.type
         return torch.autocast(device, dtype=kind)
+
+    def _start_depth(self) -> Tensor:
+        """Inverse depths (1,B*n*M,1,1,1) before the first update."""
+        device = self.patches_gt.device
+        random = torch.rand(self.clips, self.frames * self.per_frame).to(device)
+        level = (FLAT_INV_DEPTH * 2.0 ** (FLAT_SPREAD * torch.randn(self.clips, 1))).to(device)
+        flat = (torch.rand(self.clips, 1) < self.settings.flat_depth).to(device)
+        return torch.where(flat, level.expand_as(random), random).view(1, -1, 1, 1, 1)
 
     def _with_depth(self, inv_depth: Tensor) -> Tensor:
         return torch.cat([self.patches_gt[:, :, :2], inv_depth.expand_as(self.patches_gt[:, :, 2:])], dim=2)

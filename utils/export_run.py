@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from devo.checkpoint import default_weights, load_network
+from devo.checkpoint import builtin_weights, default_weights, load_network
 from devo.config import Config
 from devo.device import fast_dtype, resolve_device
 from devo.errors import InputError, TrackingError
@@ -94,13 +94,18 @@ class ExportOptions:
         return ["quality", ("sor", {"neighbors": self.sor_nb_neighbors, "std_ratio": self.sor_std_ratio})]
 
 
-def find_config(name: str | None, dataset: str) -> Path:
-    """The settings file: as given, or in the project's `config/`; without a name the preset of the dataset.
+def find_config(name: str | None, dataset: str, weights: str = "") -> Path:
+    """The settings file: as given, or in the project's `config/`.
+
+    Without a name: the preset of the built-in weights (`tiny.yaml` for `devo-tiny`), else that of the dataset.
 
     Raises:
         InputError: no such file.
     """
-    wanted = Path(name or f"config/{DEFAULT_CONFIG.get(dataset, 'default.yaml')}")
+    preset = f"{weights.removeprefix('devo-')}.yaml" if weights in builtin_weights() else ""
+    if not preset or not (ROOT / "config" / preset).is_file():
+        preset = DEFAULT_CONFIG.get(dataset, "default.yaml")
+    wanted = Path(name or f"config/{preset}")
     for candidate in (wanted, ROOT / wanted, ROOT / "config" / wanted.name):
         if candidate.is_file():
             return candidate
@@ -139,9 +144,9 @@ def export_pointcloud(options: ExportOptions) -> dict[str, Any]:
     started = time.perf_counter()
     products = Products.of(options.out)
     device = resolve_device(options.device)
-    config = find_config(options.config, options.dataset)
-    cfg = Config().merge_from_file(config).merge_from_list(options.opts or [])
     weights = find_weights(options.weights)
+    config = find_config(options.config, options.dataset, weights)
+    cfg = Config().merge_from_file(config).merge_from_list(options.opts or [])
     sequence = open_sequence(options.dataset, options.datapath, options.sequence_options())
     # the frame network has no scorer
     selector = "random" if options.rgb and cfg.PATCH_SELECTOR == "scorer" else cfg.PATCH_SELECTOR

@@ -81,7 +81,7 @@ def _by_shared_windows(
         level.allocate(step)
     # the last step of a frame runs on into later edges; what it computes for them is not used
     patch_of_edge = torch.cat([kk[order], kk.new_zeros(step)])
-    patches = gmap[0].flatten(1)
+    patches = gmap[0].flatten(2).transpose(1, 2).flatten(1)
     staged = out.new_empty(step, *out.shape[1:])
     pairs = out.view(edges, -1)
     first = 0
@@ -93,7 +93,7 @@ def _by_shared_windows(
             used = min(step, last - start)
             many = -(-used // SHAPE_STEP) * SHAPE_STEP
             part = patches.index_select(0, patch_of_edge[start : start + many])
-            features = part.view(many, channels, pixels).transpose(1, 2)
+            features = part.view(many, pixels, channels)
             for number, level in enumerate(levels):
                 level.look_up(features, start, used, staged[:used, ..., number])
             pairs[order[start : start + used]] = staged[:used].view(used, -1)
@@ -120,8 +120,8 @@ class _Level:
         # a window that begins a whole window before the map, or right behind it, already sees nothing of it
         corner = torch.minimum((lowest - radius).clamp_(min=-margin), base.new_tensor([[width], [height]]))
         inner = (base - (radius + corner)[:, None]).clamp_(0, self.window - self.side)
-        self.start = (corner[1] + margin).long() * self.stride + (corner[0] + margin).long()
-        self.inner = (inner[1] * self.window + inner[0]).t().contiguous().long()
+        self.start = (corner[1] + margin).int() * self.stride + (corner[0] + margin).int()
+        self.inner = (inner[1] * self.window + inner[0]).t().contiguous().int()
         fraction = fraction.to(torch.promote_types(maps.dtype, torch.float32))
         self.fraction = fraction.transpose(1, 2).flatten(1)[..., None]
         self.left_over = torch.nonzero(spread > self.window - self.side).squeeze(1)
@@ -137,16 +137,16 @@ class _Level:
         window, margin, pixels = self.window, self.margin, self.inner.shape[1]
         area, run = window * window, self.side * window - (window - self.side)
         self.start = torch.cat([self.start, self.start.new_zeros(step)])
-        self.inner += torch.arange(pixels) * area
+        self.inner += torch.arange(pixels, dtype=torch.int32) * area
         padded = self.maps.new_zeros(height + 2 * margin, self.stride, channels)
         self.interior = padded[margin : margin + height, margin : margin + width]
         # rows of overlapping views are runs of memory: the pixels of a window row, the rows of a pixel's own window
         self.map_runs = padded.as_strided((padded.numel() // channels - window + 1, window * channels), (channels, 1))
-        self.row_start = torch.arange(window) * self.stride
+        self.row_start = torch.arange(window, dtype=torch.int32) * self.stride
         self.gathered = self.maps.new_empty(step, area, channels)
         self.volume = self.maps.new_empty(step, pixels, area)
         self.volume_runs = self.volume.as_strided((self.volume.numel() - run + 1, run), (1, 1))
-        self.volume_start = (torch.arange(step) * (pixels * area))[:, None]
+        self.volume_start = (torch.arange(step, dtype=torch.int32) * (pixels * area))[:, None]
         self.own = self.maps.new_empty(step * pixels, run)
         self.along_x = self.fraction.new_empty(step * pixels, run - 1)
         self.blended = self.fraction.new_empty(step * pixels, run - 1 - window)

@@ -46,7 +46,6 @@ def test_a_recording_is_written_and_summarised(tmp_path: Path, capsys: pytest.Ca
     (["--fps", "0"], 2, "images per second"),
     (["--threshold", "nan"], 2, "threshold"),
     (["--device", "tpu9"], 2, "device"),
-    (["--device", "cuda:77"], 2, "not available"),
 ])
 def test_bad_arguments_give_one_line(arguments: list[str], code: int, words: str, tmp_path: Path,
                                      capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,12 +48,15 @@ class VirtualCamera:
 
     def points(self, columns: FloatArray, rows: FloatArray, depth: FloatArray) -> FloatArray:
         """`(N, 3)` float64 points in the camera frame of pixels and their z-depths, all `(N,)`."""
-        return np.stack([(columns - self.cx) / self.focal * depth, (rows - self.cy) / self.focal * depth, depth], axis=1)
+        x, y = (columns - self.cx) / self.focal, (rows - self.cy) / self.focal
+        return np.stack([x * depth, y * depth, depth], axis=1)
 
 
 @dataclass(frozen=True)
 class DepthPlanes:
-    """Depths of the planes. In inverse depth plane 0 is the farthest, in depth the nearest; the other end is not reached.
+    """Depths of the planes.
+
+    In inverse depth plane 0 is the farthest, in depth it is the nearest; the other end of the range is not reached.
 
     Attributes:
         near, far: depth range in the unit of the poses.

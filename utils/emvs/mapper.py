@@ -225,11 +225,12 @@ def map_events(reader: EventReader, trajectory: Trajectory, event_camera: EventC
 def _window(reader: EventReader, track: PoseTrack, start_us: float | None,
             stop_us: float | None) -> tuple[float, float, dict[str, int]]:
     """The span with events and poses, and how much time of the wanted window has events but no poses."""
-    first, last = reader.time_range_us()
-    first, last = max(float(first), start_us or -np.inf), min(float(last), np.inf if stop_us is None else stop_us)
+    recorded = reader.time_range_us()
+    first = recorded[0] if start_us is None else max(recorded[0], start_us)
+    last = recorded[1] if stop_us is None else min(recorded[1], stop_us)
     if not first <= last:
-        raise InputError(f"{reader.path}: events span {reader.time_range_us()[0]} us to {reader.time_range_us()[1]} us, "
-                         f"none lies in the window from {start_us} us to {stop_us} us")
+        raise InputError(f"{reader.path}: events span {recorded[0]} us to {recorded[1]} us, none lies in the window "
+                         f"from {start_us} us to {stop_us} us")
     start, stop = common_span(track, first, last)
     return start, stop, {"us_before_first_pose": round(start - first), "us_after_last_pose": round(last - stop)}
 

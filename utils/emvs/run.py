@@ -52,6 +52,11 @@ class EmvsOptions:
     check_poses: bool = True
     settings: EmvsSettings = dataclasses.field(default_factory=EmvsSettings)
 
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Sensor size (width, height), None if it was not given."""
+        return (self.image_size[0], self.image_size[1]) if self.image_size else None
+
 
 def run_emvs(options: EmvsOptions) -> EmvsMap:
     """Map a recording and write every product next to `options.out`.
@@ -66,8 +71,7 @@ def run_emvs(options: EmvsOptions) -> EmvsMap:
     files = _find_files(options)
     trajectory = read_poses(files["poses"], options.pose_format, options.pose_convention)
     sparse = None if options.cloud is None else _read_sparse(options)
-    calibration = read_calibration(files["calib"], tuple(options.image_size) if options.image_size else None,
-                                   _size_in(files["events"]))
+    calibration = read_calibration(files["calib"], options.size, _size_in(files["events"]))
     event_camera = EventCamera(*rectify_map(calibration))
     sample = PacketSample(options.settings.packet_size)
     with open_events(files["events"], sensor_size=event_camera.size) as reader:
@@ -112,9 +116,8 @@ def _find_files(options: EmvsOptions) -> dict[str, Path]:
     """Events, poses and calibration: as given, the rest from the folder of a generic recording."""
     given = {name: Path(value) for name in ("events", "poses", "calib") if (value := getattr(options, name))}
     if options.datapath is not None:
-        size = tuple(options.image_size) if options.image_size else None
         sequence = open_sequence("generic", given.get("events", Path(options.datapath)), SequenceOptions(
-            calib=given.get("calib"), image_size=size))  # type: ignore[arg-type]
+            calib=given.get("calib"), image_size=options.size))
         found = sequence.describe()["files"]
         roles = {"events": "events", "poses": "ground truth", "calib": "calibration"}
         given = {name: Path(found[role]) for name, role in roles.items() if role in found} | given
@@ -186,5 +189,5 @@ def _report(result: EmvsMap, check: ConventionCheck | None, written: list[Path])
                    "coinciding votes): the poses seem to be world to camera; try --pose_convention T_cw",
                    file=sys.stderr)
     if not len(result.cloud):
-        raise DevoError("no pixel has a depth that is believed: lower --adaptive_threshold_c, check the depth range and "
-                        f"the radius filter; look at {written[-1].parent}")
+        raise DevoError("no pixel has a depth that is believed: lower --adaptive_threshold_c, check the depth range "
+                        f"and the radius filter; look at the files in {written[-1].parent}")

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devo.errors import InputError
-from devo.poses import invert_poses_numpy, matrix_to_pose, pose_to_matrix
+from devo.poses import invert_poses_numpy, matrix_to_pose
 from utils.emvs.settings import EmvsSettings
 from utils.trajectory_io import Trajectory
 
@@ -29,7 +29,7 @@ class PoseTrack:
 
     def __init__(self, trajectory: Trajectory) -> None:
         if len(trajectory) < 2:
-            raise InputError(f"the trajectory has {len(trajectory)} pose(s), expected at least 2 to interpolate between")
+            raise InputError(f"the trajectory has {len(trajectory)} pose(s), expected at least 2 to interpolate")
         from scipy.spatial.transform import Rotation, Slerp
 
         self.trajectory = trajectory
@@ -175,12 +175,8 @@ def depth_range_from_points(points: npt.ArrayLike, world_T_view: FloatArray, cam
     limit = np.array(size) / (2 * camera_focal)
     inside = (z > 0) & (np.abs(seen[:, :2]) <= limit * z[:, None]).all(axis=1)
     if not inside.any():
-        raise InputError(f"none of the {len(world)} finite points of the cloud lies in the reference view, so they give "
-                         "no depth range; check that cloud and poses share a frame, or give --min_depth and --max_depth")
+        raise InputError(f"none of the {len(world)} finite points of the cloud lies in the reference view, so they "
+                         "give no depth range; check that cloud and poses share a frame, or give --min_depth and "
+                         "--max_depth")
     low, high = np.percentile(z[inside], (5, 95))
     return 0.8 * float(low), 1.2 * float(high)
-
-
-def view_matrix(world_T_view: npt.ArrayLike) -> FloatArray:
-    """`(4, 4)` matrix of a pose `(7,)`."""
-    return pose_to_matrix(world_T_view)

@@ -15,7 +15,7 @@ from utils.events.prophesee_decoders import Decoded, Decoder, Evt2Decoder, Evt3D
 from utils.events.types import Events
 from utils.events.validate import Order, TimeUnit
 
-_BLOCK_BYTES = 1 << 19  # the work arrays of one block stay in the processor's cache
+_BLOCK_BYTES = 1 << 18  # the work arrays of one block stay in the processor's cache
 _LONGEST_HEADER = 1 << 16
 _OUTSIDE = "events outside the sensor"
 _CUT_OFF = "incomplete words"
@@ -157,10 +157,8 @@ class RawEventReader(LossyReader):
         if len(data) < _BLOCK_BYTES:
             return words, None, len(data) % dtype.itemsize
         # The word behind the block tells whether the last time word of the block can be trusted.
-        coarse = self._decoder.coarse_time_words(words)
-        if not len(coarse) or not coarse[-1]:
-            return words, None, 0
-        return words[:coarse[-1]], self._decoder.ticks_of(words[coarse[-1]]), 0
+        last = self._decoder.last_coarse_word(words)
+        return (words[:last], self._decoder.ticks_of(words[last]), 0) if last else (words, None, 0)
 
     def _inside(self, decoded: Decoded, lost: Counter[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the columns of the events inside the sensor."""

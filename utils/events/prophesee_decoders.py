@@ -11,6 +11,7 @@ that really runs backwards is passed on as it is, for the caller to refuse.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -64,8 +65,8 @@ class Decoder(Protocol):
 
     word_dtype: np.dtype[Any]
 
-    def coarse_time_words(self, words: Words) -> npt.NDArray[np.intp]:
-        """Return where the words stand that set the coarse time counter."""
+    def last_coarse_word(self, words: Words) -> int | None:
+        """Return where the last word stands that sets the coarse time counter, None if there is none."""
 
     def decode(self, words: Words, state: State, next_ticks: int | None) -> Decoded:
         """Decode a run of words; `next_ticks` is the raw coarse counter just behind it, where known."""
@@ -130,6 +131,31 @@ def _spread(values: npt.NDArray[Any], events_before: npt.NDArray[Any], start: An
     return np.repeat(np.concatenate([np.array([start], values.dtype), values]), np.diff(borders))
 
 
+class _Specials(NamedTuple):
+    """The words of an EVT3 run other than single events, and their types."""
+
+    word: npt.NDArray[np.uint16]
+    kind: npt.NDArray[np.uint8]
+
+
+def _vector_tables() -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Tabulate vector words by their lower 13 bits (types 4 and 5 differ in bit 12, and 5 has 8 pixels).
+
+    Returns:
+        (8192,) number of set pixels, (8192,) where their offsets begin in the third table, (K,) offsets.
+    """
+    words = np.arange(1 << 13)
+    masks = np.where(words >> 12, words & 0xFF, words & 0xFFF)
+    of_word, offsets = np.nonzero(masks[:, None] >> np.arange(12) & 1)
+    counts = np.bincount(of_word, minlength=len(words))
+    return counts, np.cumsum(counts) - counts, offsets
+
+
+_EVENTS_IN_VECTOR, _FIRST_BIT_OF_VECTOR, _BITS_OF_VECTOR = _vector_tables()
+_ADVANCE = np.array([0, 0, 0, 0, 12, 8], np.int64)
+_KNOWN_EVT3 = np.isin(np.arange(16), (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15))
+
+
 class Evt3Decoder:
     """EVT3: 16-bit words, the upper 4 bits are the type.
 
@@ -139,12 +165,10 @@ class Evt3Decoder:
 
     word_dtype = np.dtype("<u2")
     _TICK_BITS = 12
-    _KNOWN = np.isin(np.arange(16), (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15))
-    _ONES = np.array([bin(mask).count("1") for mask in range(1 << 12)], np.int64)
 
-    def coarse_time_words(self, words: Words) -> npt.NDArray[np.intp]:
-        """Return where the TIME_HIGH words stand."""
-        return np.flatnonzero(words.view(np.uint8)[1::2] >> 4 == 8)
+    def last_coarse_word(self, words: Words) -> int | None:
+        """Return where the last TIME_HIGH word stands."""
+        return _last(words, lambda part: part >> 12 == 8)
 
     def ticks_of(self, word: Words) -> int:
         """Return the 12-bit counter of a TIME_HIGH word."""
@@ -153,103 +177,100 @@ class Evt3Decoder:
     def decode(self, words: Words, state: State, next_ticks: int | None) -> Decoded:
         """Decode a run of words; see `Decoder`."""
         kind = words.view(np.uint8)[1::2] >> 4
+        is_single = kind == 2
+        single = words[np.flatnonzero(is_single)]
+        at = np.flatnonzero(~is_single)  # everything below works on these words, a minority
+        special = _Specials(words[at], kind[at])
+        events_before = at - np.arange(len(at))
+        events, base_x, polarity = self._with_vectors(single, special, events_before, state)
+        x, p = events & np.uint16(0xFFF), (events >> np.uint16(15)).astype(np.uint8)
+
         lost: Counter[str] = Counter()
-        is_row, is_single = kind == 0, kind == 2
-        is_vector = (kind == 4) | (kind == 5)
-        is_event = is_single | is_vector
-        at = np.flatnonzero(is_event)
-        events_before = np.cumsum(is_event, dtype=np.int32)
-        vectors = np.flatnonzero(is_vector[at])
-        x, p = self._columns(words[at])
-        outputs_before: npt.NDArray[Any] | None = None
-        total = len(at)
-        if len(vectors):
-            x, p, outputs_before = self._expand(words, kind, at, x, p, vectors, state)
-            total = int(outputs_before[-1])
-
-        def before(positions: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
-            counts = events_before[positions]
-            return counts if outputs_before is None else outputs_before[counts]
-
-        rows = np.flatnonzero(is_row)
-        rows_before, row_values = before(rows), words[rows] & np.uint16(0x7FF)
-        y = _spread(row_values, rows_before, state.y or 0, total)
-        time_at, stamps, ticks = self._times(words, kind, state, next_ticks, lost)
-        stamps_before = before(time_at)
-        t_us = _spread(stamps, stamps_before, state.t_us or 0, total)
-        start = max(0 if state.y is not None else int(rows_before[0]) if len(rows) else total,
-                    0 if state.t_us is not None else int(stamps_before[0]) if len(stamps) else total)
+        rows = np.flatnonzero(special.kind == 0)
+        row_values = special.word[rows] & np.uint16(0x7FF)
+        y = _spread(row_values, events_before[rows], state.y or 0, len(x))
+        says, stamps, ticks = self._times(special, events_before, len(x), state, next_ticks, lost)
+        t_us = _spread(stamps, events_before[says], state.t_us or 0, len(x))
+        start = max(0 if state.y is not None else int(events_before[rows[0]]) if len(rows) else len(x),
+                    0 if state.t_us is not None else int(events_before[says[0]]) if len(says) else len(x))
         lost[EARLY] += start
-        if len(unknown := np.bincount(kind, minlength=16)[~self._KNOWN]) and unknown.any():
-            lost[UNKNOWN] += int(unknown.sum())
-        base_x, polarity = self._base_behind(words, kind, state)
+        lost[UNKNOWN] += len(at) - int(np.count_nonzero(_KNOWN_EVT3[special.kind]))
         behind = State(ticks, int(stamps[-1]) if len(stamps) else state.t_us,
                        int(row_values[-1]) if len(rows) else state.y, base_x, polarity)
         return Decoded(x[start:], y[start:], t_us[start:], p[start:], behind, +lost)
 
-    @staticmethod
-    def _columns(words: Words) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
-        return words & np.uint16(0x7FF), (words.view(np.uint8)[1::2] >> 3) & np.uint8(1)
-
-    def _times(self, words: Words, kind: npt.NDArray[np.uint8], state: State, next_ticks: int | None,
-               lost: Counter[str]) -> tuple[npt.NDArray[np.intp], Stamps, int | None]:
-        """Return where the time changes and to what, and the unwrapped coarse counter behind the words."""
-        is_coarse = kind == 8
-        at = np.flatnonzero(is_coarse | (kind == 6))
-        coarse = np.flatnonzero(is_coarse[at])
-        ticks, keep = _unwrap(words[at[coarse]] & np.uint16(0xFFF), self._TICK_BITS, state.ticks, next_ticks)
+    def _times(self, special: _Specials, events_before: npt.NDArray[np.int64], total: int, state: State,
+               next_ticks: int | None, lost: Counter[str]) -> tuple[npt.NDArray[np.intp], Stamps, int | None]:
+        """Return which special words change the time and to what, and the unwrapped coarse counter behind them."""
+        at = np.flatnonzero((special.kind == 8) | (special.kind == 6))
+        value = special.word[at] & np.uint16(0xFFF)
+        coarse = np.flatnonzero(special.kind[at] == 8)
+        ticks, keep = _unwrap(value[coarse], self._TICK_BITS, state.ticks, next_ticks)
         lost[CONTRADICTED] += len(keep) - int(np.count_nonzero(keep))
         first = 0 if state.ticks is not None else int(coarse[keep][0]) if keep.any() else len(at)
-        fine = (words[at] & np.uint16(0xFFF)).astype(np.int64)
-        stamps = (_spread(ticks, coarse, state.ticks or 0, len(at)) << self._TICK_BITS) + fine
+        stamps = (_spread(ticks, coarse, state.ticks or 0, len(at)) << self._TICK_BITS) + value
         # A coarse word that repeats the counter says nothing; one that changes it starts at fine time 0.
-        changed = np.diff(ticks, prepend=-1 if state.ticks is None else state.ticks) != 0
         stamps[coarse] = ticks << self._TICK_BITS
         says = np.ones(len(at), bool)
-        says[coarse] = changed & keep
+        says[coarse] = (np.diff(ticks, prepend=-1 if state.ticks is None else state.ticks) != 0) & keep
         says[:first] = False
         at, stamps = at[says], stamps[says]
         plausible = _plausible_stamps(stamps, state.t_us, 1 << self._TICK_BITS)
         if plausible is not None:
-            lost[CONTRADICTED] += len(plausible) - int(np.count_nonzero(plausible))
+            # Healthy cameras write stray fine time words too; they cost nothing where no event follows them.
+            events_behind = np.diff(events_before[at], append=total)
+            lost[CONTRADICTED] += int(np.count_nonzero(~plausible & (events_behind > 0)))
             at, stamps = at[plausible], stamps[plausible]
         return at, stamps, int(ticks[-1]) if keep.any() else state.ticks
 
-    def _expand(self, words: Words, kind: npt.NDArray[np.uint8], at: npt.NDArray[np.intp], x: npt.NDArray[np.uint16],
-                p: npt.NDArray[np.uint8], vectors: npt.NDArray[np.intp], state: State,
-                ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8], npt.NDArray[np.int64]]:
-        """Turn each vector word into the events of its set bits; also return the events before each event word."""
-        group = np.flatnonzero((kind >= 3) & (kind <= 5))
-        advance = np.array([0, 12, 8], np.int64)[kind[group] - 3]
-        advanced = np.cumsum(advance) - advance  # by the vectors before, since the start of the run
-        is_base = kind[group] == 3
-        base_x, base_p = self._columns(words[group[is_base]])
-        where_base = np.flatnonzero(is_base)
-        start = _spread(base_x - advanced[is_base], where_base, state.base_x, len(group))
-        polarity = _spread(base_p, where_base, state.polarity, len(group))
-        x[vectors] = (start + advanced)[~is_base]
-        p[vectors] = polarity[~is_base]
+    @staticmethod
+    def _with_vectors(single: Words, special: _Specials, events_before: npt.NDArray[np.int64],
+                      state: State) -> tuple[npt.NDArray[np.uint16], int, int]:
+        """Return all events as `column | polarity << 15`, and base column and polarity behind them.
 
-        masks = words[at[vectors]] & np.uint16(0xFFF)
-        masks[kind[at[vectors]] == 5] &= np.uint16(0xFF)
-        counts = np.ones(len(at), np.int64)
-        counts[vectors] = self._ONES[masks]
-        offsets = np.flatnonzero(np.unpackbits(masks.view(np.uint8), bitorder="little")) & 15
-        x, p = np.repeat(x, counts), np.repeat(p, counts)
-        from_vector = np.zeros(len(at), bool)
-        from_vector[vectors] = True
-        x[np.repeat(from_vector, counts)] += offsets.astype(np.uint16)
-        return x, p, np.concatenate([[0], np.cumsum(counts)])
-
-    def _base_behind(self, words: Words, kind: npt.NDArray[np.uint8], state: State) -> tuple[int, int]:
-        """Return column and polarity with which a vector behind these words would start."""
+        Adds the events of vectors to `events_before`, which counts single events when it comes in.
+        """
+        events = (single & np.uint16(0x7FF)) | (single & np.uint16(0x800)) << np.uint16(4)
+        group = np.flatnonzero((special.kind >= 3) & (special.kind <= 5))
+        if not len(group):
+            return events, state.base_x, state.polarity
+        word, kind = special.word[group], special.kind[group]
         bases = np.flatnonzero(kind == 3)
-        base_x, polarity, tail = state.base_x, state.polarity, kind
-        if len(bases):
-            word = int(words[bases[-1]])
-            base_x, polarity, tail = word & 0x7FF, (word >> 11) & 1, kind[bases[-1]:]
-        moved = 12 * int(np.count_nonzero(tail == 4)) + 8 * int(np.count_nonzero(tail == 5))
-        return (base_x + moved) & 0xFFFF, polarity
+        advance = _ADVANCE[kind]
+        moved = np.cumsum(advance)  # by the vectors up to here
+        base = word[bases].astype(np.int64)
+        # Column before all moves and polarity, in one number so that they are spread together.
+        origin = ((base & 0x7FF) - moved[bases]) * 2 + (base >> 11 & 1)
+        origin = _spread(origin, bases, 2 * state.base_x + state.polarity, len(group))
+        behind = int(origin[-1] >> 1) + int(moved[-1]) & 0x7FF, int(origin[-1] & 1)
+
+        filled = np.flatnonzero((kind != 3) & ((word & 0xFFF) != 0))
+        code = word[filled] & 0x1FFF
+        counts = _EVENTS_IN_VECTOR[code]
+        source = np.repeat(np.arange(len(filled)), counts)
+        firsts = np.cumsum(counts) - counts
+        column = (origin[filled] >> 1) + moved[filled] - advance[filled]
+        number = np.arange(len(source))
+        column = column[source] + _BITS_OF_VECTOR[(_FIRST_BIT_OF_VECTOR[code] - firsts)[source] + number]
+        in_vectors = np.zeros(len(events_before), np.int64)
+        in_vectors[group[filled]] = counts
+        events_before += np.cumsum(in_vectors) - in_vectors
+        place = (events_before[group[filled]] - firsts)[source] + number
+        merged = np.empty(len(events) + len(place), np.uint16)
+        is_free = np.ones(len(merged), bool)
+        is_free[place] = False
+        merged[np.flatnonzero(is_free)] = events
+        merged[place] = (column & 0xFFF) | (origin[filled] & 1)[source] << 15
+        return merged, *behind
+
+
+def _last(words: Words, condition: Callable[[Words], npt.NDArray[np.bool_]]) -> int | None:
+    """Return the index of the last word that meets a condition; looks at the end first, where it usually is."""
+    for start in (max(len(words) - 4096, 0), 0):
+        found = np.flatnonzero(condition(words[start:]))
+        if len(found):
+            return start + int(found[-1])
+    return None
 
 
 class Evt2Decoder:
@@ -268,9 +289,9 @@ class Evt2Decoder:
         """Return the 32 bits with type, time, column and row, and the mask of the pixels to the right, if any."""
         return words, None
 
-    def coarse_time_words(self, words: Words) -> npt.NDArray[np.intp]:
-        """Return where the TIME_HIGH words stand."""
-        return np.flatnonzero(self._split(words)[0] >> 28 == 8)
+    def last_coarse_word(self, words: Words) -> int | None:
+        """Return where the last TIME_HIGH word stands."""
+        return _last(words, lambda part: self._split(part)[0] >> 28 == 8)
 
     def ticks_of(self, word: Words) -> int:
         """Return the 28-bit counter of a TIME_HIGH word."""

@@ -51,6 +51,8 @@ def launch(options: argparse.Namespace) -> int:
     try:
         if resume:
             trainer.resume(resume)
+        elif options.init:
+            trainer.validate_and_keep()
         reason = trainer.train()
         _reporter(rank)(f"stopped at step {trainer.step}: {reason}; {folder / 'last.pth'} and {folder / 'best.pth'}")
     except torch.OutOfMemoryError as error:

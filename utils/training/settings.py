@@ -53,6 +53,7 @@ class TrainSettings:
         clips: clips per step. sizes: (height, width) windows, one drawn per step.
         structure_only: probability, per step, that poses stay at the truth.
         perturbed: probability, per clip, to start between identity and truth (else at identity).
+        flat_depth: probability, per clip, of equal initial depths, see `devo.unroll_state.UnrollSettings`.
         solver_gradient_every, match_gradient_every: see `devo.unroll_state.UnrollSettings`.
         score_every: the scorer runs with gradient in every k-th step.
         steps, learning_rate, warmup, schedule, clip_gradient, weight_decay, ema: optimisation; `warmup` in steps,
@@ -76,6 +77,7 @@ class TrainSettings:
     sizes: tuple[tuple[int, int], ...] = ((128, 160), (112, 176), (144, 144))
     structure_only: float = 0.1
     perturbed: float = 0.5
+    flat_depth: float = 0.7
     solver_gradient_every: int = 1
     match_gradient_every: int = 2
     score_every: int = 1

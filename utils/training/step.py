@@ -18,6 +18,7 @@ from devo.losses import (
     flow_loss,
     masked_mean,
     pose_loss,
+    same_direction,
     score_loss,
 )
 from devo.unroll import UnrollResult, UnrollStep, unroll_clips
@@ -72,6 +73,7 @@ class TrainingStep(nn.Module):
             initial_frames=wanted.initial_frames,
             solver_gradient_every=wanted.solver_gradient_every,
             match_gradient_every=wanted.match_gradient_every,
+            flat_depth=wanted.flat_depth,
             probe=wanted.loss.probe > 0,
             mixed_precision=PRECISIONS[wanted.precision],
         )
@@ -114,7 +116,8 @@ def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> d
         total = total + plan.published_weight * weights.flow * flow
         if number >= 2 and not plan.structure_only and step.poses is not None:
             frames = step.poses.shape[1]
-            pose = pose_loss(step.poses.data, result.poses_gt.data[:, :frames])[0]
+            pair = step.poses.data, result.poses_gt.data[:, :frames]
+            pose = pose_loss(*pair, used=same_direction(*pair))[0]
             parts["pose"].append(pose)
             total = total + plan.published_weight * weights.pose * pose
     if result.probe is not None and weights.probe > 0:

@@ -75,6 +75,7 @@ def _figures(network: eVONet, clips: TrainingClips, settings: ValidationSettings
             steps=settings.updates,
             patches_per_image=settings.patches,
             drop_probability=0.0,
+            flat_depth=1.0,
             probe=True,
             initial_frames=settings.initial_frames,
         ),

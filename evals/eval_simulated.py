@@ -1,0 +1,201 @@
+#!/usr/bin/env python3
+"""Measure the odometry on simulated sequences with perfect ground truth, against two baselines.
+
+Every sequence differs in scene, textures, motion and sensor size from what training draws (other seeds, and the
+hand-held motion of the full simulator instead of short clips). Variants: `trained` (the weights as they are), `random
+patches` (the same network, patches drawn at random instead of by its scorer) and `untrained` (the same architecture,
+random weights). A run counts as lost if the tracker says so or its error exceeds a fifth of the path.
+
+Example: python evals/eval_simulated.py --split test --trials 3
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+SCENES = ("board", "room", "planes", "corridor")
+SIZES = ((240, 180), (346, 260), (320, 240))
+PRESETS = ("slow", "normal", "normal", "fast", "slow")
+FIRST_SEED = {"val": 7_000, "test": 9_000}
+PER_SCENE = 5
+LOST_ABOVE = 0.2  # of the path length
+VARIANTS = ("trained", "random patches", "untrained")
+
+
+@dataclass(frozen=True)
+class Score:
+    """Outcome of one run: `ate` as a share of the path length, `depth` the median relative depth error after scale."""
+
+    sequence: str
+    variant: str
+    trial: int
+    status: str
+    ate: float
+    depth: float
+    points: int
+    keyframes: int
+    tracked_share: float
+    fps: float
+
+    @property
+    def lost(self) -> bool:
+        """Whether the result is unusable."""
+        return self.status != "tracked" or not self.ate <= LOST_ABOVE
+
+
+def sequences(split: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Names and simulator settings of the sequences of a split: every scene with several sizes and motions."""
+    for index, scene in enumerate(SCENES):
+        for k in range(PER_SCENE):
+            size, preset = SIZES[(index + k) % len(SIZES)], PRESETS[(index + k) % len(PRESETS)]
+            seed = FIRST_SEED[split] + 100 * index + k
+            yield f"{scene}_{preset}_{size[0]}x{size[1]}_{seed}", {
+                "scene": scene, "seed": seed, "preset": preset, "size": size}
+
+
+def evaluate(name: str, settings: dict[str, Any], seconds: float, cache: Path, network: Any, cfg: Any, variant: str,
+             trial: int) -> Score:
+    """Simulate the sequence if it is not in the cache, track it and compare with the truth."""
+    import numpy as np
+
+    from utils.datasets.registry import SequenceOptions, open_sequence
+    from utils.eval_utils import track
+    from utils.simulator.dataset_folder import FolderOptions, write_recording
+    from utils.simulator.sequence import SequenceSettings, SimulatedSequence
+
+    simulated = SequenceSettings(seconds=seconds, **settings)
+    folder = cache / f"{name}_{seconds:g}s"
+    if not folder.is_dir():
+        write_recording(folder, simulated, FolderOptions(depth=False))
+    recording = open_sequence("generic", folder, SequenceOptions())
+    start = time.perf_counter()
+    result = track(recording.voxels(), cfg, network, seed=trial)
+    fps = len(result.poses) / (time.perf_counter() - start)
+    ate = depth = float("nan")
+    if result.ok and result.observables is not None:
+        truth = recording.ground_truth()
+        assert truth is not None, f"{folder} was simulated, so it has a ground truth"
+        ate, scale = trajectory_share(result.tstamps, result.poses, *truth)
+        depth = depth_error(result.observables, scale, SimulatedSequence(simulated))
+    count = 0 if result.observables is None or not np.isfinite(ate) else len(result.observables)
+    return Score(name, variant, trial, result.status.value, ate, depth, count, result.counters.get("keyframes", 0),
+                 result.tracked_share, fps)
+
+
+def trajectory_share(tstamps: Any, poses: Any, stamps: Any, truth: Any) -> tuple[float, float]:
+    """ATE (Sim3, RMSE) as a share of the true path between the matched frames, and the scale of the alignment."""
+    import numpy as np
+
+    from evals.alignment import umeyama_sim3
+
+    centres = np.stack([np.interp(tstamps, stamps, truth[:, axis]) for axis in range(3)], axis=1)
+    alignment = umeyama_sim3(poses[:, :3].astype(np.float64), centres)
+    error = np.linalg.norm(alignment.apply(poses[:, :3]) - centres, axis=1)
+    length = np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()
+    return float(np.sqrt((error * error).mean()) / length), float(alignment.scale)
+
+
+def depth_error(observables: Any, scale: float, simulated: Any) -> float:
+    """Median of |scale * depth - true depth| / true depth over the points that the quality filter keeps."""
+    import numpy as np
+    import torch
+
+    from utils.clouds.filters import quality_filter
+    from utils.export_products import observables_to_cloud
+
+    keep, _ = quality_filter(observables_to_cloud(observables))
+    stamps, host = np.unique(observables.t_us[keep], return_inverse=True)
+    if len(stamps) == 0:
+        return float("nan")
+    column, row = np.rint(observables.pixel_xy[keep]).astype(int).T
+    truth = torch.cat([simulated.depth(stamps[i:i + 8]) for i in range(0, len(stamps), 8)])[host, row, column].numpy()
+    seen = truth > 0
+    return float(np.median(np.abs(scale * observables.depths[keep][seen] - truth[seen]) / truth[seen]))
+
+
+def summarise(scores: Sequence[Score], variant: str) -> dict[str, Any]:
+    """Medians over the runs of one variant that were not lost, and how many were."""
+    import numpy as np
+
+    mine = [score for score in scores if score.variant == variant]
+    good = [score for score in mine if not score.lost]
+
+    def median(values: list[float]) -> float:
+        return float(np.median(values)) if values else float("nan")
+
+    worst = sorted({score.sequence for score in mine if score.lost})
+    return {"variant": variant, "runs": len(mine), "lost runs": len(mine) - len(good), "lost sequences": len(worst),
+            "ate_percent": 100 * median([score.ate if not score.lost else np.inf for score in mine]),
+            "ate_percent_tracked": 100 * median([score.ate for score in good]),
+            "depth_percent": 100 * median([score.depth for score in good]),
+            "points": median([score.points for score in good]), "fps": median([score.fps for score in mine])}
+
+
+def build_arg_parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--split", choices=FIRST_SEED, default="test")
+    parser.add_argument("--weights", help="default: the built-in ones")
+    parser.add_argument("--config", help="default: the preset of the built-in weights")
+    parser.add_argument("--opts", nargs="+", default=[], help="override settings, KEY VALUE ...")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--trials", type=int, default=3)
+    parser.add_argument("--every", type=int, default=1, help="use every n-th sequence")
+    parser.add_argument("--seconds", type=float, default=3.0, help="length of the sequences [s]")
+    parser.add_argument("--cache", type=Path, default=Path("datasets/simulated"), help="where sequences are kept")
+    parser.add_argument("--json", type=Path, help="also write all scores to this file")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Evaluate and print Markdown tables."""
+    args = build_arg_parser().parse_args(argv)
+    from devo.checkpoint import load_network
+    from devo.config import Config
+    from utils.export_run import find_config, find_weights
+
+    weights = find_weights(args.weights)
+    cfg = Config().merge_from_file(find_config(args.config, "generic", weights)).merge_from_list(args.opts)
+    networks: dict[str, tuple[Any, Config]] = {}
+    for variant in args.variants:
+        variant_cfg = cfg.clone()
+        source = weights
+        if variant == "random patches":
+            variant_cfg.PATCH_SELECTOR = "random"
+        if variant == "untrained":
+            trained: Any = load_network(weights)
+            source = f"random:0:{trained.dim_inet},{trained.dim_fnet},{trained.dim}"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            networks[variant] = load_network(source, patch_selector=variant_cfg.PATCH_SELECTOR), variant_cfg
+    scores: list[Score] = []
+    print("| sequence | variant | trial | status | ATE % | depth % | points | keyframes | fps |\n|" + "---|" * 9)
+    for name, settings in list(sequences(args.split))[::args.every]:
+        for variant, (network, variant_cfg) in networks.items():
+            for trial in range(args.trials):
+                score = evaluate(name, settings, args.seconds, args.cache, network, variant_cfg, variant, trial)
+                scores.append(score)
+                print(f"| {name} | {variant} | {trial} | {score.status} | {100 * score.ate:.2f} | "
+                      f"{100 * score.depth:.2f} | {score.points} | {score.keyframes} | {score.fps:.2f} |", flush=True)
+    rows = [summarise(scores, variant) for variant in args.variants]
+    print("\n| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
+    for row in rows:
+        print("| " + " | ".join(f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()) + " |")
+    if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(json.dumps({"summary": rows, "scores": [asdict(score) for score in scores]}, indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
