@@ -12,6 +12,7 @@ from devo.altcorr.correlation import corr, draw_kept_edges
 from devo.altcorr.volumes import Volume, look_up, volume_shape
 from devo.altcorr.windows import check_edges
 from devo.errors import InputError
+from devo.kernels import cuda_kernel
 
 MAX_VOLUME_BYTES = 1 << 31
 """Largest correlation volumes kept in memory; bigger samples are correlated edge by edge instead."""
@@ -68,7 +69,8 @@ class CorrBlock:
             self.pyramid = [level.to(compute) for level in pooled]
             size = sum(math.prod(volume_shape(gmap, level, radius, clips)) for level in self.pyramid) * compute.itemsize
             self.volumes: list[Volume] | None = None
-            if fmap.device.type == "cpu" and size <= MAX_VOLUME_BYTES:
+            twin = cuda_kernel("altcorr", fmap, gmap) is None
+            if twin and fmap.device.type == "cpu" and size <= MAX_VOLUME_BYTES:
                 self.volumes = [Volume(self.gmap, level, radius, clips) for level in self.pyramid]
 
     def __call__(self, ii: Tensor, jj: Tensor, coords: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from devo.altcorr.windows import blend, check_edges, pixel_rows, split_coords, s
 from devo.errors import InputError
 from devo.kernels import cuda_kernel
 
-CHUNK_ELEMENTS = 1 << 22
+CHUNK_ELEMENTS = {"cpu": 1 << 22, "other": 1 << 26}
 """Feature values gathered at a time; bounds the temporary memory whatever the number of edges."""
 
 
@@ -60,7 +60,8 @@ def corr(
     if dropout < 1 and torch.is_grad_enabled() and (fmap1.requires_grad or fmap2.requires_grad):
         keep = draw_kept_edges(len(ii), dropout, coords.device, generator)
     side, patch, channels = 2 * radius + 2, fmap1.shape[-1], fmap1.shape[2]
-    chunk = chunk_edges or max(1, CHUNK_ELEMENTS // max(1, side * side * patch * patch * channels))
+    elements = CHUNK_ELEMENTS["cpu" if fmap1.device.type == "cpu" else "other"]
+    chunk = chunk_edges or max(1, elements // max(1, side * side * patch * patch * channels))
     with torch.autocast(fmap1.device.type, enabled=False):
         return _Corr.apply(fmap1, fmap2, coords.detach(), ii, jj, radius, keep, chunk)
 

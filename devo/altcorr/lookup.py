@@ -16,6 +16,7 @@ from torch import Tensor
 from devo.altcorr.correlation import corr
 from devo.altcorr.windows import check_edges, split_coords
 from devo.errors import InputError
+from devo.kernels import cuda_kernel
 
 CHUNK_BYTES = 1 << 23
 """Gathered features per step; larger steps fall out of the cache, smaller ones are dominated by call overhead."""
@@ -55,7 +56,7 @@ def corr_features(
     check_edges("corr_features", coords, kk, jj, patch)
     out = gmap.new_empty(edges, side, side, patch * patch, levels)
     with torch.no_grad(), torch.autocast(gmap.device.type, enabled=False):
-        if gmap.device.type != "cpu":
+        if cuda_kernel("altcorr", gmap, *pyramid) is not None or gmap.device.type != "cpu":
             _by_corr(out, gmap, pyramid, coords, kk, jj, radius)
         elif edges:
             _by_shared_windows(out, gmap, pyramid, coords, kk, jj, radius)

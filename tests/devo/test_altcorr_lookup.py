@@ -178,6 +178,14 @@ def test_features_repeat_bit_by_bit_and_ignore_autocast() -> None:
         assert torch.equal(corr_features(*problem), first)
 
 
+def test_insisting_on_the_extension_fails_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEVO_KERNELS", "cuda")
+    with pytest.raises(InputError, match="DEVO_KERNELS"):
+        corr_features(*tracking_problem("translated"))
+    with pytest.raises(InputError, match="DEVO_KERNELS"):
+        CorrBlock(*training_problem()[:2])
+
+
 def test_features_refuse_unequal_inputs() -> None:
     gmap, pyramid, coords, kk, jj = tracking_problem("translated")
     with pytest.raises(InputError, match="corr_features got the pyramid nothing"):

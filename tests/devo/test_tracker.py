@@ -281,3 +281,26 @@ def test_retired_edges_survive_keyframe_removal() -> None:
     assert max(pairs) < tracker.n
     structure = tracker.result(observables=True).observables
     assert np.nanquantile(structure.residual_px, 0.9) < 1.0
+
+
+def state_bytes(tracker: DEVO) -> int:
+    """Everything the tracker holds in tensors that can grow, edges and remembered observations included."""
+    records = [tracker.active_edges(), *tracker.retired_edges]
+    tensors = [t for record in records for t in (record.ii, record.jj, record.kk, record.target, record.weight)]
+    tensors += [tracker.net, tracker.poses_, tracker.patches_, tracker.index_, tracker.ring.fmap1_, tracker.ring.gmap_]
+    tensors += [pose for _, pose in tracker.delta.values()]
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+
+
+def test_memory_grows_by_keyframes_only() -> None:
+    """With every new keyframe removed again, twice as many frames cost a pose each and nothing else."""
+    tracker, scene = make_tracker(frames=60, step=0.08, KEYFRAME_THRESH=200.0, BUFFER_SIZE=32)
+    torch.manual_seed(0)
+    sizes = {}
+    for i, (voxel, intrinsics, t_us) in enumerate(scene.frames()):
+        tracker(t_us, voxel, intrinsics)
+        sizes[i] = state_bytes(tracker)
+        if i == 39:
+            keyframes = tracker.n
+    assert tracker.is_initialized and tracker.n == keyframes and tracker.N == 32
+    assert sizes[59] - sizes[39] <= 20 * 7 * 4

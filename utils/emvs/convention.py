@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
 from utils.emvs.geometry import DepthPlanes
-from utils.emvs.mapper import EventCamera, View, ViewVoter
+from utils.emvs.mapper import EventCamera, View, ViewVoter, mean_square
 from utils.emvs.settings import EmvsSettings
 from utils.emvs.views import PoseTrack
 from utils.events.types import Events
@@ -52,7 +51,8 @@ class PacketSample:
         """Look at the next piece of the stream; its incomplete last packet is passed over."""
         for first in range(0, len(events) - self._size + 1, self._size):
             if self._seen % self._every == 0:
-                self._packets.append(events[first:first + self._size])
+                chosen = events[first:first + self._size]  # copied, so that the rest of the piece can be freed
+                self._packets.append(Events(chosen.x.copy(), chosen.y.copy(), chosen.t_us.copy(), chosen.p.copy()))
                 if len(self._packets) > _MOST_PACKETS:
                     self._packets = self._packets[::2]
                     self._every *= 2
@@ -85,6 +85,6 @@ def check_convention(view: View, events: Events, track: PoseTrack, event_camera:
         voter.add(inside)
         voter.finish()
         total = float(voter.dsi.sum(dtype=torch.float64))
-        squares = np.sum([float(plane.double().square().sum()) for plane in voter.dsi])
-        sharpness.append(float(squares / total) if total > 0 else 0.0)
+        squares = mean_square(voter.dsi) * voter.dsi.numel()
+        sharpness.append(squares / total if total > 0 else 0.0)
     return ConventionCheck(*sharpness)

@@ -175,7 +175,7 @@ def _describe(result: EmvsMap, options: EmvsOptions, files: dict[str, Path], cal
 
 def _report(result: EmvsMap, check: ConventionCheck | None, written: list[Path]) -> None:
     events = sum(view.counts["events"] for view in result.views)
-    seconds = sum(view.counts["voting_s"] for view in result.views)
+    seconds = sum(view.counts["read_and_vote_s"] for view in result.views)
     late = {name: us for name, us in result.counts.items() if name.startswith("us_") and us}
     tqdm.write(f"{len(result.cloud)} points from {events:.0f} events in {len(result.views)} view(s), "
                f"{events / 1e6 / max(seconds, 1e-3):.2f} million events/s; "

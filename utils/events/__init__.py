@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from utils.events.reader import EventReader, MemoryEventReader, open_events
+from utils.events.reader import EventReader, MemoryEventReader, open_events, open_events_as_stored
 from utils.events.slicing import (
     CountWindows,
     EventSlicer,
@@ -36,6 +36,7 @@ __all__ = [
     "compute_ms_to_idx",
     "make_events",
     "open_events",
+    "open_events_as_stored",
     "write_events_h5",
     "write_events_npz",
     "write_events_text",

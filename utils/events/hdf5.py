@@ -1,4 +1,4 @@
-"""Events in HDF5: the DSEC layout (`events/{x,y,t,p}`, `ms_to_idx`, `t_offset`) or the columns at the root."""
+"""Events in HDF5, in the layouts of DSEC (also TUM-VIE, VECtor), M3ED, MVSEC or with the columns at the root."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 
 from devo.errors import InputError
+from utils.events.hdf5_layouts import find_layout, is_complete
 from utils.events.reader import RowReader
 from utils.events.validate import (
     Column,
@@ -57,7 +58,8 @@ class Hdf5EventReader(RowReader):
 
     Arguments as in `open_events`; `path` may be an open `h5py.File`, which then stays open on `close`.
     The scalar `t_offset` (microseconds), where present, is added to all stamps. The sensor size comes from the
-    root attributes `width` and `height` if the caller gives none.
+    root attributes `width` and `height` or from what lies beside the events if the caller gives none. `stream`
+    picks one of several cameras (see `find_layout`).
 
     Raises:
         InputError: datasets are missing, of unequal length, not written to their end or damaged; see also
@@ -67,17 +69,18 @@ class Hdf5EventReader(RowReader):
     format_name = "HDF5"
 
     def __init__(self, path: Path | h5py.File, sensor_size: tuple[int, int] | None = None,
-                 time_unit: TimeUnit | None = None, order: Order = "error") -> None:
+                 time_unit: TimeUnit | None = None, order: Order = "error", stream: str | None = None) -> None:
         given_file = path if isinstance(path, h5py.File) else None
         super().__init__(Path(given_file.filename if given_file else path), sensor_size, order)  # type: ignore[arg-type]
         self._owns_file = given_file is None
         self._file = given_file if given_file is not None else open_hdf5(self.path)
         try:
             with hdf5_errors(self.path):
-                self._datasets = self._find_datasets()
+                layout = find_layout(self._file, self.path, stream)
+                self._datasets = layout.columns
                 self.rows = self._check_datasets()
                 self.t_offset_us = self._read_offset()
-                self.sensor_size = sensor_size if sensor_size is not None else self._read_sensor_size()
+                self.sensor_size = sensor_size or self._read_sensor_size() or layout.sensor_size
                 self._unit: TimeUnit = time_unit or guess_time_unit(self._datasets["t"][:4096])
                 self._align_blocks()
             if time_unit is None and self.rows:
@@ -92,27 +95,12 @@ class Hdf5EventReader(RowReader):
         if self._owns_file:
             self._file.close()
 
-    def _find_datasets(self) -> dict[str, Any]:
-        group: Any = self._file
-        if isinstance(self._file.get("events"), h5py.Group) and "x" not in self._file:
-            group = self._file["events"]
-        missing = [name for name in "xytp" if not isinstance(group.get(name), h5py.Dataset)]
-        if missing:
-            found = ", ".join(sorted(group.keys())) or "nothing"
-            raise InputError(f"{self.path}: dataset{'s' * (len(missing) > 1)} {', '.join(missing)} missing in "
-                             f"{group.name!r}, found {found}; expected events/x, y, t, p or x, y, t, p at the root")
-        return {name: group[name] for name in "xytp"}
-
     def _check_datasets(self) -> int:
         rows = check_lengths(self._datasets, str(self.path))
         for name, dataset in self._datasets.items():
             if dataset.dtype.kind not in "iufb":
                 raise InputError(f"{self.path}: dataset {name} has dtype {dataset.dtype}, expected numbers")
-            if dataset.chunks is None:
-                complete = dataset.id.get_storage_size() >= rows * dataset.dtype.itemsize
-            else:
-                complete = dataset.id.get_num_chunks() >= -(-rows // dataset.chunks[0])
-            if not complete:  # HDF5 would invent zeros for what was never written
+            if not is_complete(dataset):
                 raise InputError(f"{self.path}: dataset {name} announces {rows} events but parts of it were never "
                                  "written; the recording or conversion was interrupted, repeat it")
         return rows

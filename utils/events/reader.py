@@ -220,6 +220,13 @@ class _Opening(NamedTuple):
     sensor_size: tuple[int, int] | None
     time_unit: TimeUnit | None
     order: Order
+    stream: str | None
+
+    def single(self) -> tuple[Path, tuple[int, int] | None, TimeUnit | None, Order]:
+        """Return the arguments of a format that holds one stream; refuse the wish for another."""
+        if self.stream is not None:
+            raise InputError(f"{self.path}: the file holds one event stream, stream={self.stream!r} makes no sense")
+        return self.path, self.sensor_size, self.time_unit, self.order
 
 
 def _open_hdf5(opening: _Opening) -> EventReader:
@@ -229,38 +236,58 @@ def _open_hdf5(opening: _Opening) -> EventReader:
 
 def _open_npz(opening: _Opening) -> EventReader:
     from utils.events.numpy_files import NpzEventReader
-    return NpzEventReader(*opening)
+    return NpzEventReader(*opening.single())
 
 
 def _open_npy(opening: _Opening) -> EventReader:
     from utils.events.numpy_files import NpyEventReader
-    return NpyEventReader(*opening)
+    return NpyEventReader(*opening.single())
 
 
 def _open_text(opening: _Opening) -> EventReader:
     from utils.events.text import TextEventReader
-    return TextEventReader(*opening)
+    return TextEventReader(*opening.single())
+
+
+def _open_prophesee(opening: _Opening) -> EventReader:
+    from utils.events.prophesee import RawEventReader
+    return RawEventReader(*opening.single())
+
+
+def _open_aedat4(opening: _Opening) -> EventReader:
+    from utils.events.aedat4 import Aedat4EventReader
+    return Aedat4EventReader(*opening)
+
+
+def _open_bag(opening: _Opening) -> EventReader:
+    from utils.events.bags import BagEventReader
+    return BagEventReader(*opening)
 
 
 _FORMATS: tuple[tuple[bytes, Callable[[_Opening], EventReader]], ...] = (
     (b"\x89HDF\r\n\x1a\n", _open_hdf5),
     (b"PK\x03\x04", _open_npz),
     (b"\x93NUMPY", _open_npy),
+    (b"% ", _open_prophesee),
+    (b"#!AER-DAT", _open_aedat4),
+    (b"#ROSBAG", _open_bag),
+    (b"\x89MCAP0\r\n", _open_bag),
+    (b"SQLite format 3\0", _open_bag),
 )
 _FOREIGN: tuple[tuple[bytes, str], ...] = (
-    (b"#ROSBAG", "a ROS 1 bag"),
-    (b"#!AER-DAT", "an AEDAT recording"),
-    (b"% ", "a Prophesee RAW or DAT recording"),
     (b"\x89PNG", "a PNG image"),
 )
 
 
 def open_events(path: str | os.PathLike[str], *, sensor_size: tuple[int, int] | None = None,
-                time_unit: TimeUnit | None = None, on_unsorted: Order = "error") -> EventReader:
+                time_unit: TimeUnit | None = None, on_unsorted: Order = "error",
+                stream: str | None = None) -> EventReader:
     """Open an event recording; the format is found by content, not by the name.
 
-    Formats: text `t x y p` (the Event Camera Dataset form), NPZ with `x y t p`, NPY (structured or (N,4) with
-    columns t x y p), HDF5 with `events/{x,y,t,p}` or `{x,y,t,p}` at the root (DSEC layout, Blosc included).
+    Formats: text `t x y p` (the Event Camera Dataset form); NPZ with `x y t p`; NPY (structured or (N,4) with
+    columns t x y p); HDF5 as in DSEC, TUM-VIE, VECtor (`events/{x,y,t,p}`), M3ED, MVSEC or with `{x,y,t,p}` at the
+    root (Blosc included); Prophesee RAW (EVT2, EVT2.1, EVT3); AEDAT4; bags of ROS 1 and 2 with `dvs_msgs` or
+    `prophesee_event_msgs` (a bag of ROS 2 may be a folder).
 
     Args:
         path: the file.
@@ -268,6 +295,7 @@ def open_events(path: str | os.PathLike[str], *, sensor_size: tuple[int, int] | 
         time_unit: unit of the stamps in the file: "s", "ms", "us" or "ns". None: what the header says, else whole
             numbers are microseconds and fractions are seconds.
         on_unsorted: "error", or "sort" to load everything into memory and sort it by time (stable).
+        stream: which camera of a file with several: a topic or group, or a part of its name such as "left".
 
     Raises:
         InputError: the file is missing, empty, of an unknown format or damaged; damage that appears
@@ -275,13 +303,7 @@ def open_events(path: str | os.PathLike[str], *, sensor_size: tuple[int, int] | 
     """
     path = Path(path)
     check_options(time_unit, on_unsorted, sensor_size)
-    head = _first_bytes(path)
-    opening = _Opening(path, sensor_size, time_unit, on_unsorted)
-    opener = next((function for magic, function in _FORMATS if head.startswith(magic)), None)
-    if opener is None:
-        _refuse_foreign(path, head)
-        opener = _open_text
-    reader = opener(opening)
+    reader = _opener(path)(_Opening(path, sensor_size, time_unit, on_unsorted, stream))
     try:
         if on_unsorted == "sort":
             return _sorted_in_memory(reader)
@@ -293,6 +315,32 @@ def open_events(path: str | os.PathLike[str], *, sensor_size: tuple[int, int] | 
         reader.close()
         raise
     return reader
+
+
+def open_events_as_stored(path: str | os.PathLike[str], *, sensor_size: tuple[int, int] | None = None,
+                          time_unit: TimeUnit | None = None, stream: str | None = None) -> EventReader:
+    """Open a recording to inspect it: `chunks()` passes unsorted stamps on instead of refusing or sorting them.
+
+    Arguments as in `open_events`. Only `chunks()` without borders is meaningful if the stamps turn out unsorted.
+
+    Raises:
+        InputError: see `open_events`; unsorted stamps are no error here.
+    """
+    path = Path(path)
+    check_options(time_unit, "sort", sensor_size)
+    return _opener(path)(_Opening(path, sensor_size, time_unit, "sort", stream))
+
+
+def _opener(path: Path) -> Callable[[_Opening], EventReader]:
+    """Find the format of a file by its first bytes."""
+    if path.is_dir() and (path / "metadata.yaml").is_file():
+        return _open_bag
+    head = _first_bytes(path)
+    opener = next((function for magic, function in _FORMATS if head.startswith(magic)), None)
+    if opener is None:
+        _refuse_foreign(path, head)
+        opener = _open_text
+    return opener
 
 
 def _first_bytes(path: Path) -> bytes:
@@ -309,7 +357,7 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def _refuse_foreign(path: Path, head: bytes) -> None:
-    supported = "supported are text (t x y p), npz, npy and HDF5"
+    supported = "supported are text (t x y p), npz, npy, HDF5, Prophesee RAW, AEDAT4 and ROS bags"
     for magic, name in _FOREIGN:
         if head.startswith(magic):
             raise InputError(f"{path} is {name}, which is not read directly; {supported}, convert it first")

@@ -32,7 +32,7 @@ float32), trained from random initialisation on simulated events only. Voxel gri
 | loss weights | {losses} |
 
 ## Validation
-{clips} simulated clips of 10 frames, 160x128, seed outside the training range; identity poses and random depths at the
+{clips} simulated clips of 10 frames, 160x128, seed outside the training range; identity poses and equal depths at the
 start, 12 updates, errors in quarter-resolution pixels:
 
 | figure | value | meaning |
