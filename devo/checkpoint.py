@@ -22,6 +22,7 @@ from devo.safe_pickle import READ_ERRORS, read_inert
 from devo.update import correlation_size
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+PREFERRED_WEIGHTS = "devo-tiny"  # what runs on a laptop
 RANDOM_PREFIX = "random:"
 RANDOM_USAGE = "random:SEED[:dim_inet,dim_fnet,dim][:rgb], for example random:0 or random:0:128,64,16"
 SCORER_PREFIX = "patchify.scorer."
@@ -36,7 +37,7 @@ def builtin_weights() -> dict[str, Path]:
 def default_weights() -> str | None:
     """Name of the built-in event network used when none is asked for, None if the package ships without."""
     names = [name for name in builtin_weights() if "rgb" not in name]
-    return names[0] if names else None
+    return PREFERRED_WEIGHTS if PREFERRED_WEIGHTS in names else next(iter(names), None)
 
 
 def load_network(

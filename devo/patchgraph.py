@@ -40,7 +40,8 @@ class EdgeRecords:
 
     def select(self, mask: Tensor) -> EdgeRecords:
         """The edges where `mask` (bool `(E,)`) is set."""
-        return EdgeRecords(self.ii[mask], self.jj[mask], self.kk[mask], self.target[mask], self.weight[mask], self.newest)
+        ii, jj, kk = self.ii[mask], self.jj[mask], self.kk[mask]
+        return EdgeRecords(ii, jj, kk, self.target[mask], self.weight[mask], self.newest)
 
     def compact(self) -> EdgeRecords:
         """The same edges with int32 indices, for keeping over a long run."""

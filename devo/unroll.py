@@ -14,6 +14,7 @@ from torch import Tensor
 
 from devo.errors import InputError
 from devo.unroll_state import GrowingGraph, JoinedClips, UnrollSettings
+from devo.voxel_augment import random_voxel_augment
 
 if TYPE_CHECKING:
     from devo.enet import eVONet
@@ -102,7 +103,15 @@ def unroll(
     Arguments as in `unroll_clips`, `STEPS` updates; one `UnrollStep` per update.
     """
     settings = UnrollSettings(steps=STEPS, patches_per_image=patches_per_image, structure_only=structure_only)
-    return unroll_clips(network, network.normalize(images), poses, disps, intrinsics, settings).steps
+    return unroll_clips(network, prepare_images(network, images), poses, disps, intrinsics, settings).steps
+
+
+def prepare_images(network: eVONet, images: Tensor) -> Tensor:
+    """Normalise raw clips (B,n,C,H,W) as the network wants them, and augment them where it trains with `randaug`."""
+    images = network.normalize(images)
+    if network.training and getattr(network, "randaug", False):
+        return random_voxel_augment(images)
+    return images
 
 
 def unroll_clips(

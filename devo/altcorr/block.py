@@ -32,8 +32,8 @@ class CorrBlock:
         dropout: probability with which an edge takes part in the backward pass of a call, without rescaling.
         levels: divisors of the pyramid; level l is `fmap` average-pooled in blocks of `levels[l]` pixels.
         clips: number of equally long clips joined in the sample; edges never connect two of them.
-        compute_dtype: dtype of the products, by default the one both maps promote to; bfloat16 is faster where the CPU
-            multiplies it in hardware.
+        compute_dtype: dtype of the products and of the result, by default the one both maps promote to; bfloat16 is
+            faster where the CPU multiplies it in hardware, and halves the memory.
         generator: source of the randomness of `dropout`.
 
     Raises:
@@ -61,8 +61,7 @@ class CorrBlock:
         self.radius, self.dropout, self.levels, self.clips = radius, dropout, tuple(levels), clips
         self.generator = generator
         self.frames, self.patches = fmap.shape[1] // clips, gmap.shape[1] // clips
-        self.dtype = torch.promote_types(fmap.dtype, gmap.dtype)
-        compute = compute_dtype or self.dtype
+        compute = self.dtype = compute_dtype or torch.promote_types(fmap.dtype, gmap.dtype)
         with torch.autocast(fmap.device.type, enabled=False):
             self.gmap = gmap.to(compute)
             pooled = [torch.nn.functional.avg_pool2d(fmap[0], n, n)[None] if n > 1 else fmap for n in self.levels]
@@ -82,7 +81,7 @@ class CorrBlock:
             coords: (1, E, 2, P, P) float32 positions (x, y) in pixels of `fmap`; no gradient flows to them.
 
         Returns:
-            (1, E, (2R+1)**2 * P*P * L) in the dtype of the maps; index (((xo*(2R+1) + yo)*P + i)*P + j)*L + l, see
+            (1, E, (2R+1)**2 * P*P * L) in the compute dtype; index (((xo*(2R+1) + yo)*P + i)*P + j)*L + l, see
             `corr` for the meaning of the shifts xo and yo.
 
         Raises:
@@ -109,4 +108,4 @@ class CorrBlock:
             corr(self.gmap, level, coords / n, ii, jj, self.radius, self.dropout, generator=self.generator)
             for level, n in zip(self.pyramid, self.levels, strict=True)
         ]
-        return torch.stack(levels, dim=-1).flatten(2).to(self.dtype)
+        return torch.stack(levels, dim=-1).flatten(2)

@@ -169,6 +169,14 @@ def test_chunks_change_no_bit(edges: int, chunk: int | None) -> None:
         assert torch.equal(first, second)
 
 
+def test_a_hundred_thousand_edges() -> None:
+    fmap1, fmap2, coords, ii, jj = random_problem(16, 100_000, channels=3, patch=1)
+    out = corr(fmap1, fmap2, coords, ii, jj, 1)
+    some = slice(None, None, 997)
+    wanted = closed_form(fmap1, fmap2, coords[:, some], ii[some], jj[some], 1)
+    assert (out[:, some] - wanted).abs().max() <= CORRELATION_CLOSED_FORM
+
+
 @pytest.mark.parametrize("value", [1e20, -1e20, 3e9, -3e9, 2.0**31, 2.0**63, -(2.0**63), 1e6])
 def test_far_positions_see_nothing(value: float) -> None:
     fmap1, fmap2, coords, ii, jj = random_problem(2)

@@ -314,7 +314,7 @@ def test_block_computing_in_bfloat16(maps_dtype: torch.dtype) -> None:
     wanted = torch.autograd.grad(precise.sum(), (fmap, gmap))
     maps = [tensor.detach().to(maps_dtype).requires_grad_() for tensor in (fmap, gmap)]
     ours = CorrBlock(*maps, dropout=1.0, clips=2, compute_dtype=torch.bfloat16)(kk, jj, positions[1])
-    assert ours.dtype == maps_dtype
+    assert ours.dtype == torch.bfloat16
     assert (ours.float() - precise).abs().max() <= CORRELATION_HALF * precise.abs().max()
     for gradient, expected in zip(torch.autograd.grad(ours.float().sum(), maps), wanted):
         assert gradient.dtype == maps_dtype

@@ -86,7 +86,9 @@ def tartan_root(tmp_path: Path) -> Path:
         rows[:, 6] = 1
         np.savetxt(base / "image_left" / inner / "pose_left.txt", rows)
         for i in range(FRAMES + 1):
-            np.save(base / "depth_left" / inner / "depth_left" / f"{i:06d}_left_depth.npy", np.full((HEIGHT, WIDTH), 5.0))
+            np.save(
+                base / "depth_left" / inner / "depth_left" / f"{i:06d}_left_depth.npy", np.full((HEIGHT, WIDTH), 5.0)
+            )
             if i:
                 with h5py.File(base / "evs_left" / inner / "h5" / f"{i:010d}.h5", "w") as file:
                     file["voxel"] = rng.normal(size=(5, HEIGHT, WIDTH)).astype(np.float16)
@@ -110,7 +112,9 @@ def test_clip_of_the_reader_is_geometrically_right(tartan_root: Path) -> None:
     steps = clip.world_T_cam[0, 1:, 0] - clip.world_T_cam[0, :-1, 0]
     assert bool((steps * 5 / STEP_M - (steps * 5 / STEP_M).round()).abs().max() < 1e-5)
     assert clip.intrinsics[0, 0].tolist() == list(INTRINSICS)
-    again = open_scene(tartan_root, find_scenes(tartan_root)[0], tartan_root / "cache")  # the graph comes from the cache
+    again = open_scene(
+        tartan_root, find_scenes(tartan_root)[0], tartan_root / "cache"
+    )  # the graph comes from the cache
     for (a, b), (c, d) in zip(scene.graph, again.graph):
         assert np.array_equal(a, c)
         assert np.array_equal(b, d)

@@ -10,6 +10,7 @@ from utils.emvs.geometry import PacketRays
 from utils.emvs.settings import Vote
 
 _BILINEAR, _NEAREST, _ZERO_PADDING = 0, 1, 0
+_BANDS = 8
 _STEP_VOTES = {"cpu": 1 << 16, "cuda": 1 << 23}
 """Votes per step: few on the CPU, so that they stay in its cache; many on CUDA (about 30 bytes each)."""
 
@@ -44,31 +45,38 @@ def cast_votes(dsi: Tensor, rays: PacketRays, vote: Vote = "bilinear") -> None:
         raise InputError(f"the DSI is {dsi.dtype} {tuple(dsi.shape)}, expected float32 ({planes}, H, W)")
     if not packets:
         return
-    step = max(1, _STEP_VOTES["cuda" if dsi.device.type != "cpu" else "cpu"] // rays.u.numel())
-    step = max(step, torch.get_num_threads() if dsi.device.type == "cpu" else 1)
+    on_cpu = dsi.device.type == "cpu"
+    step = max(1, _STEP_VOTES["cpu" if on_cpu else "cuda"] // rays.u.numel(), torch.get_num_threads() if on_cpu else 1)
+    events = _in_bands(rays) if on_cpu else torch.stack([rays.u, rays.v, rays.side])[:, None]
     masked = not rays.all_in_front
     for first in range(0, planes, step):
         rows = slice(first, min(first + step, planes))
-        position = _positions(rays, rows)
-        weight = _weights(position, rays, rows, masked)
+        position = _positions(events, rays, rows)
+        weight = torch.maximum(position[:, 0].abs(), position[:, 1].abs()).le_(1.0)
+        if masked:
+            weight *= events[2] * rays.ahead[rows, None, :, None] > 0
         dsi[rows] += _splat(position, weight, dsi.shape[1], dsi.shape[2], vote)
 
 
-def _positions(rays: PacketRays, rows: slice) -> Tensor:
-    """Normalised positions `(P', 2, K, S)` on some planes."""
-    gain = rays.gain[rows, :, None]
-    position = torch.empty((gain.shape[0], 2, *rays.u.shape), dtype=torch.float32, device=rays.u.device)
-    for axis, (start, offset) in enumerate(((rays.u, rays.offset_u), (rays.v, rays.offset_v))):
-        torch.mul(start, gain, out=position[:, axis]).add_(offset[rows, :, None])
+def _in_bands(rays: PacketRays) -> Tensor:
+    """Events `(3, B, K, S / B)` as u, v, side: packets sorted by row and cut in B bands, all k-th bands together.
+
+    Successive votes then fall into few rows of a slice, which a fast cache can hold (a third more votes per second).
+    """
+    packets, size = rays.u.shape
+    bands = _BANDS if size % _BANDS == 0 else 1
+    v, order = rays.v.sort(dim=1, stable=True)
+    events = torch.stack([rays.u.gather(1, order), v, rays.side.gather(1, order)])
+    return events.view(3, packets, bands, size // bands).transpose(1, 2).contiguous()
+
+
+def _positions(events: Tensor, rays: PacketRays, rows: slice) -> Tensor:
+    """Normalised positions `(P', 2, B, K, S / B)` on some planes."""
+    gain = rays.gain[rows, None, :, None]
+    position = torch.empty((gain.shape[0], 2, *events.shape[1:]), dtype=torch.float32, device=events.device)
+    for axis, offset in enumerate((rays.offset_u, rays.offset_v)):
+        torch.mul(events[axis], gain, out=position[:, axis]).add_(offset[rows, None, :, None])
     return position
-
-
-def _weights(position: Tensor, rays: PacketRays, rows: slice, masked: bool) -> Tensor:
-    """`(P', K, S)` float32, 1 for rays that meet the plane inside the image and in front of their camera, else 0."""
-    weight = torch.maximum(position[:, 0].abs(), position[:, 1].abs()).le_(1.0)
-    if masked:
-        weight *= rays.side * rays.ahead[rows, :, None] > 0
-    return weight
 
 
 def _splat(position: Tensor, weight: Tensor, height: int, width: int, vote: Vote) -> Tensor:

@@ -7,6 +7,7 @@ is a flatbuffer whose only field is a vector of 16-byte records.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import struct
 import xml.etree.ElementTree
@@ -74,7 +75,7 @@ class Aedat4EventReader(LossyReader):
             raise InputError(f"{path}: the AEDAT4 recording has no stream with events")
         self._stream = names[choose_stream(list(names), stream, str(path))]
         self.sensor_size = sensor_size if sensor_size is not None else self._stream.sensor_size
-        self._decompress = _decompressor(self._header.compression, path)
+        self._decompressor = _decompressor(self._header.compression, path)
         self._file = path.open("rb")
         self._size = path.stat().st_size
         self._starts = [self._header.size]
@@ -97,7 +98,7 @@ class Aedat4EventReader(LossyReader):
         if not parts and not lost:
             return None
         if lost[_CUT_OFF]:
-            offset = self._size
+            offset = max(self._size, self._header.data_end)
         if block + 1 == len(self._starts):
             self._starts.append(offset)
         self._note_losses(block, +lost, f"in bytes {start} to {offset}")
@@ -107,30 +108,26 @@ class Aedat4EventReader(LossyReader):
 
     def _next_packet(self, offset: int, lost: Counter[str]) -> tuple[int, bytes, int] | None:
         """Return stream, data (of the wanted stream only) and end of the packet at `offset`, None behind the last."""
-        end = self._header.data_end if self._header.data_end >= 0 else self._size
-        if offset == end or offset >= self._size:
-            return None
-        if offset + _PACKET_HEAD > self._size:
-            lost[_CUT_OFF] += 1
+        data_end = self._header.data_end
+        if offset == data_end or offset >= max(self._size, data_end):
             return None
         self._file.seek(offset)
-        number, size = struct.unpack("<ii", self._file.read(_PACKET_HEAD))
-        behind = offset + _PACKET_HEAD + size
-        if number not in self._header.numbers or size < 0 or behind > max(end, 0):
-            if number in self._header.numbers and size >= 0 and behind > self._size and end >= self._size:
-                lost[_CUT_OFF] += 1
-                return None
-            raise InputError(f"{self.path}: the packet at byte {offset} names stream {number} and {size} bytes, which "
-                             "cannot be; the recording is damaged there")
-        if behind > self._size:
-            lost[_CUT_OFF] += 1
-            return None
-        return number, self._file.read(size) if number == self._stream.number else b"", behind
+        head = self._file.read(_PACKET_HEAD)
+        if len(head) == _PACKET_HEAD:
+            number, size = struct.unpack("<ii", head)
+            behind = offset + _PACKET_HEAD + size
+            if number not in self._header.numbers or size < 0 or 0 <= data_end < behind:
+                raise InputError(f"{self.path}: the packet at byte {offset} names stream {number} and {size} bytes, "
+                                 "which cannot be; the recording is damaged there")
+            if behind <= self._size:
+                return number, self._file.read(size) if number == self._stream.number else b"", behind
+        lost[_CUT_OFF] += 1
+        return None
 
     def _events_in(self, data: bytes, lost: Counter[str]) -> list[np.ndarray]:
         try:
-            return [_event_records(self._decompress(data))]
-        except (ValueError, RuntimeError, EOFError, MemoryError, struct.error):
+            return [_event_records(self._decompressor.run(data))]
+        except (ValueError, EOFError, MemoryError, struct.error, self._decompressor.error):
             lost[_DAMAGED] += 1
             return []
 
@@ -228,28 +225,24 @@ def _event_records(packet: bytes) -> npt.NDArray[np.void]:
     if size != len(packet) - 4:
         raise ValueError("an event packet has another size than it says")
     start, count = _Table(packet[4:], b"EVTS").vector(0, _RECORD.itemsize)
-    return np.frombuffer(packet, _RECORD, count, start + 4)
+    return np.frombuffer(packet, _RECORD, count, start + 4) if count else np.empty(0, _RECORD)
 
 
-def _decompressor(compression: str, path: Path) -> Callable[[bytes], bytes]:
-    if compression == "none":
-        return bytes
-    candidates = {"lz4": ("lz4.frame",), "zstd": ("compression.zstd", "backports.zstd", "zstandard")}[compression]
-    for name in candidates:
-        try:
+class _Decompressor(NamedTuple):
+    """A decompression function and what it raises on damage."""
+
+    run: Callable[[bytes], bytes]
+    error: type[Exception]
+
+
+def _decompressor(compression: str, path: Path) -> _Decompressor:
+    candidates = {"none": (), "lz4": ("lz4.frame",), "zstd": ("compression.zstd", "backports.zstd", "zstandard")}
+    for name in candidates[compression]:
+        with contextlib.suppress(ImportError):
             module = importlib.import_module(name)
-        except ImportError:
-            continue
-        decompress: Callable[[bytes], bytes] = module.decompress
-        damage = tuple(error for error in (getattr(module, "ZstdError", None),) if error is not None)
-
-        def checked(data: bytes) -> bytes:
-            try:
-                return decompress(data)
-            except damage as error:
-                raise ValueError(str(error)) from error
-
-        return checked
+            return _Decompressor(module.decompress, getattr(module, "ZstdError", RuntimeError))
+    if compression == "none":
+        return _Decompressor(bytes, ValueError)
     package = {"lz4": "lz4", "zstd": "backports.zstd"}[compression]
     raise InputError(f"{path}: the AEDAT4 recording is compressed with {compression}; install the package that reads "
                      f"it with pip install {package}")

@@ -47,10 +47,10 @@ def bag_errors(path: Path) -> Iterator[None]:
     """Turn what the bag library raises on damaged bags into one `InputError` that names the bag."""
     from ruamel.yaml.error import YAMLError
 
-    reader_errors: tuple[type[Exception], ...] = (*_bag_reader_errors(), YAMLError, *_compression_errors())
+    damage: tuple[type[Exception], ...] = (*_bag_reader_errors(), YAMLError, *_compression_errors(), *_DAMAGE)
     try:
         yield
-    except (*reader_errors, *_DAMAGE) as error:
+    except damage as error:
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         advice = "record or copy it again"
         if "index" in reason.lower():
@@ -70,7 +70,7 @@ def open_bag(path: Path) -> Any:
     try:
         from rosbags import rosbag1, rosbag2
     except ImportError as error:
-        raise InputError(f"{path}: reading bags needs the package rosbags; install it with pip install rosbags") from error
+        raise InputError(f"{path}: reading bags needs the package rosbags; get it with pip install rosbags") from error
     with bag_errors(path):
         is_ros2 = path.is_dir() or path.suffix in (".mcap", ".db3")
         bag: Any = rosbag2.Reader(path) if is_ros2 else rosbag1.Reader(path)
@@ -97,7 +97,7 @@ def _parse_ros1(data: bytes) -> EventMessage:
     start = 28 + name_length
     if len(data) != start + 13 * count:
         raise ValueError(f"an event message of {len(data)} bytes announces {count} events")
-    events = np.frombuffer(data, _RECORD_ROS1, count, start)
+    events = np.frombuffer(data, _RECORD_ROS1, count, start) if count else np.empty(0, _RECORD_ROS1)
     t_ns = events["sec"].astype(np.int64) * 1_000_000_000 + events["nsec"]
     return EventMessage(width, height, events["x"], events["y"], t_ns, events["p"])
 
@@ -138,7 +138,7 @@ class BagEventReader(SequentialReader):
     def __init__(self, path: Path, sensor_size: tuple[int, int] | None, time_unit: TimeUnit | None, order: Order,
                  stream: str | None = None) -> None:
         if time_unit is not None:
-            raise InputError(f"{path}: stamps in bags are seconds and nanoseconds, time_unit={time_unit!r} makes no sense")
+            raise InputError(f"{path}: stamps in bags have a fixed unit, time_unit={time_unit!r} makes no sense")
         super().__init__(path, sensor_size, order)
         self._bag = open_bag(path)
         try:
@@ -167,9 +167,9 @@ class BagEventReader(SequentialReader):
             if connection.msgtype in EVENT_MESSAGES:
                 found.setdefault(connection.topic, []).append(connection)
         if not found:
-            listing = ", ".join(sorted({f"{item.topic} ({item.msgtype})" for item in self._bag.connections})) or "nothing"
+            topics = sorted({f"{item.topic} ({item.msgtype})" for item in self._bag.connections})
             raise InputError(f"{self.path}: the bag has no topic with events (dvs_msgs or prophesee_event_msgs "
-                             f"EventArray), found {listing}")
+                             f"EventArray), found {', '.join(topics) or 'nothing'}")
         topic = choose_stream(list(found), stream, str(self.path))
         return topic, found[topic]
 

@@ -80,7 +80,9 @@ def _encoding(entries: dict[str, str], path: Path) -> tuple[str, dict[str, str]]
 
 
 def _sensor_size(entries: dict[str, str], options: dict[str, str], path: Path) -> tuple[int, int] | None:
-    text = f"{options['width']}x{options['height']}" if {"width", "height"} <= options.keys() else entries.get("geometry")
+    text = entries.get("geometry")
+    if {"width", "height"} <= options.keys():
+        text = f"{options['width']}x{options['height']}"
     if text is not None:
         match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
         size = (int(match[1]), int(match[2])) if match else (0, 0)
@@ -127,11 +129,14 @@ class RawEventReader(LossyReader):
             return Evt2Decoder()
         if header.legacy is not None:
             return Evt21Decoder(header.legacy)
+        # Not said: the half with the types is the one whose types exist and whose time words have an empty other half.
         self._file.seek(header.size)
         data = self._file.read(1 << 16)
-        halves = np.frombuffer(data[:len(data) // 8 * 8], "<u4").reshape(-1, 2) >> 28
-        known = np.isin(halves, (0, 1, 8, 10, 14, 15)).sum(axis=0)
-        return Evt21Decoder(legacy=bool(known[0] > known[1]))
+        halves = np.frombuffer(data[:len(data) // 8 * 8], "<u4").reshape(-1, 2)
+        known = np.isin(halves >> 28, (0, 1, 8, 10, 14, 15)).sum(axis=0)
+        lone_times = ((halves >> 28 == 8) & (halves[:, ::-1] == 0)).sum(axis=0)
+        first, second = known + lone_times
+        return Evt21Decoder(legacy=bool(first > second))
 
     def _decode(self, block: int) -> Events | None:
         start, state = self._starts[block]

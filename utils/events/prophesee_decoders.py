@@ -102,7 +102,8 @@ def _unwrap(raw: Words, bits: int, previous: int | None,
     if previous is None and len(steps) and steps[0] > span - span // _BACKWARDS_SHARE:
         keep[0] = False  # nothing before it: the next reading decides
     start = previous if previous is not None else (int(raw[keep][0]) if keep.any() else 0)
-    steps = np.diff(raw[keep].astype(np.int64), prepend=start % span) % span
+    readings = np.concatenate([[start % span], raw[keep].astype(np.int64)])
+    steps = np.diff(readings) % span
     steps[steps > span - span // _BACKWARDS_SHARE] -= span
     kept = np.concatenate([[start], start + np.cumsum(steps)])
     return kept[np.cumsum(keep)], keep
@@ -163,7 +164,7 @@ class Evt3Decoder:
     6 / 8 lower / upper 12 bits of the time in microseconds; 7, 15 continued; 10 trigger; 14 other.
     """
 
-    word_dtype = np.dtype("<u2")
+    word_dtype: np.dtype[Any] = np.dtype("<u2")
     _TICK_BITS = 12
 
     def last_coarse_word(self, words: Words) -> int | None:
@@ -176,7 +177,7 @@ class Evt3Decoder:
 
     def decode(self, words: Words, state: State, next_ticks: int | None) -> Decoded:
         """Decode a run of words; see `Decoder`."""
-        kind = words.view(np.uint8)[1::2] >> 4
+        kind = words.view(np.uint8)[1::2] >> np.uint8(4)
         is_single = kind == 2
         single = words[np.flatnonzero(is_single)]
         at = np.flatnonzero(~is_single)  # everything below works on these words, a minority
@@ -274,13 +275,14 @@ def _last(words: Words, condition: Callable[[Words], npt.NDArray[np.bool_]]) -> 
 
 
 class Evt2Decoder:
-    """EVT2: 32-bit words, the upper 4 bits are the type; 0 / 1 event darker / brighter, 8 coarse time, 10, 14, 15 other.
+    """EVT2: 32-bit words, the upper 4 bits are the type.
 
+    0 / 1 event darker / brighter; 8 coarse time; 10 trigger; 14, 15 other.
     An event holds the lower 6 bits of the time in microseconds, 11 bits column and 11 bits row; a coarse time word
     the upper 28 bits of the time.
     """
 
-    word_dtype = np.dtype("<u4")
+    word_dtype: np.dtype[Any] = np.dtype("<u4")
     _TICK_BITS = 28
     _FINE_BITS = 6
     _KNOWN = np.isin(np.arange(16), (0, 1, 8, 10, 14, 15))
@@ -338,7 +340,7 @@ class Evt21Decoder(Evt2Decoder):
         legacy: the half as in EVT2 comes first in the file (`endianness=legacy`), not second.
     """
 
-    word_dtype = np.dtype("<u8")
+    word_dtype: np.dtype[Any] = np.dtype("<u8")
 
     def __init__(self, legacy: bool) -> None:
         self._head = 0 if legacy else 1

@@ -163,6 +163,7 @@ class EventH5Writer:
     def _write_offset(self, offset_us: int) -> None:
         """Store the scalar inside the metadata, whose checksum then covers it too."""
         layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_obj_track_times(False)  # equal events make equal files
         layout.set_layout(h5py.h5d.COMPACT)
         scalar = h5py.h5s.create(h5py.h5s.SCALAR)
         h5py.h5d.create(self._file.id, b"t_offset", h5py.h5t.STD_I64LE, scalar, dcpl=layout)

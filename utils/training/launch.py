@@ -134,9 +134,7 @@ def _data(
     source = simulated_source(
         settings, cache, producer=producer, start_step=start * int(os.environ.get("WORLD_SIZE", "1"))
     )
-    validation = (
-        validation_clips(settings, cache, options.validation_clips) if rank == 0 and options.validation_clips else None
-    )
+    validation = validation_clips(cache, options.validation_clips) if rank == 0 and options.validation_clips else None
     return source, validation
 
 

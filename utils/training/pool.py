@@ -87,6 +87,25 @@ def ensure_shard(folder: Path, number: int, settings: ShardSettings, make: Shard
         write_shard(path, make(settings, number))
 
 
+def load_shard(
+    folder: Path, number: int, settings: ShardSettings, make: ShardMaker, repaired: Callable[[], None] = lambda: None
+) -> TrainingClips:
+    """Read shard `number`; make it where it is missing, and again, with a warning, where its file is corrupt.
+
+    Raises:
+        InputError: the new file is unusable, too.
+    """
+    ensure_shard(folder, number, settings, make)
+    try:
+        return read_shard(shard_path(folder, number), settings)
+    except InputError as error:
+        logger.warning("%s", error)
+        repaired()
+        shard_path(folder, number).unlink(missing_ok=True)
+        ensure_shard(folder, number, settings, make)
+        return read_shard(shard_path(folder, number), settings)
+
+
 def _produce(
     folder: Path, settings: ShardSettings, make: ShardMaker, position: Any, ahead: int, keep: int, nice: int
 ) -> None:
@@ -183,20 +202,15 @@ class ClipPool:
         if number in self._memory:
             self._memory.move_to_end(number)
             return self._memory[number]
-        path = shard_path(self.folder, number)
-        self._wait_for(path, number)
-        try:
-            clips = read_shard(path, self.settings)
-        except InputError as error:
-            logger.warning("%s", error)
-            self.repaired += 1
-            path.unlink(missing_ok=True)
-            ensure_shard(self.folder, number, self.settings, self.make)
-            clips = read_shard(path, self.settings)
+        self._wait_for(shard_path(self.folder, number), number)
+        clips = load_shard(self.folder, number, self.settings, self.make, self._count_repair)
         self._memory[number] = clips
         while len(self._memory) > self.shards + 1:
             self._memory.popitem(last=False)
         return clips
+
+    def _count_repair(self) -> None:
+        self.repaired += 1
 
     def _wait_for(self, path: Path, number: int) -> None:
         if self.producer == "inline":

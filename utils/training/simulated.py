@@ -7,11 +7,16 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import torch
+
 from devo.data_readers.base import TrainingClips
 from utils.training.augment import generator_for
-from utils.training.pool import ClipPool, ShardSettings
+from utils.training.pool import ClipPool, ShardSettings, load_shard
 from utils.training.settings import TrainSettings
 
+VALIDATION_FRAMES = 10
+VALIDATION_SIZE = (128, 160)
+VALIDATION_SEED = 2**31 - 7
 SIMULATOR_VERSION = 1  # part of the cache key: raise it when the simulator changes its output
 
 
@@ -57,16 +62,11 @@ def simulated_source(
     )
 
 
-def validation_clips(
-    settings: TrainSettings, cache: Path, count: int = 32, frames: int = 10, size: tuple[int, int] = (128, 160)
-) -> TrainingClips:
+def validation_clips(cache: Path, count: int = 32) -> TrainingClips:
     """Fixed clips that no training run sees (their seed lies outside the range of training seeds), cached on disk."""
-    from utils.training.pool import ensure_shard, read_shard, shard_path
-
-    part = ShardSettings(8, frames, *size, seed=2**31 - 7)
+    part = ShardSettings(8, VALIDATION_FRAMES, *VALIDATION_SIZE, seed=VALIDATION_SEED)
     folder = cache_folder(cache, part)
-    numbers = range((count + part.clips - 1) // part.clips)
-    for number in numbers:
-        ensure_shard(folder, number, part, simulate_shard)
-    parts = [read_shard(shard_path(folder, number), part).to("cpu").with_unit_depth() for number in numbers]
-    return TrainingClips.join(parts)
+    parts = []
+    for number in range((count + part.clips - 1) // part.clips):
+        parts.append(load_shard(folder, number, part, simulate_shard).to("cpu").with_unit_depth())
+    return TrainingClips.join(parts).clips(torch.arange(count))

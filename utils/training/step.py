@@ -21,7 +21,7 @@ from devo.losses import (
     same_direction,
     score_loss,
 )
-from devo.unroll import UnrollResult, UnrollStep, unroll_clips
+from devo.unroll import UnrollResult, UnrollStep, prepare_images, unroll_clips
 from devo.unroll_state import UnrollSettings
 from utils.training.settings import LossSettings, TrainSettings
 
@@ -80,7 +80,7 @@ class TrainingStep(nn.Module):
 
     def forward(self, clips: TrainingClips, plan: StepPlan) -> dict[str, Tensor]:
         """Total loss (key `total`) and its parts (without gradient) for a batch on the network's device."""
-        images = self.network.normalize(clips.voxels)
+        images = prepare_images(self.network, clips.voxels)
         poses = SE3(clips.world_T_cam).inv()
         result = unroll_clips(
             self.network,

@@ -23,7 +23,7 @@ class ValidationSettings:
     updates: int = 12
     patches: int = 32
     initial_frames: int = 8
-    batch: int = 4
+    batch: int = 2
     seed: int = 12345
 
 
