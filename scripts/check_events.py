@@ -75,10 +75,17 @@ def _sample(reader: EventReader, statistics: EventStatistics) -> Events:
     """Return a slice from the middle of the recording, or its first events if they are not in order."""
     if statistics.backward_steps:
         return next(reader.chunks(_MOST_SAMPLE_EVENTS))
+    length = round(_SAMPLE_SECONDS * 1e6)
+    middle = reader.read(*_around(statistics.first_us + statistics.duration_us // 2, length))
+    if len(middle):
+        return middle[:_MOST_SAMPLE_EVENTS]
     rate = statistics.rate
-    busiest_of_middle = len(rate.events) // 3 + int(rate.events[len(rate.events) // 3:].argmax())
-    start = statistics.first_us + busiest_of_middle * rate.bin_us
-    return reader.read(start, start + int(_SAMPLE_SECONDS * 1e6) + 1)[:_MOST_SAMPLE_EVENTS]
+    busiest = statistics.first_us + int(rate.events.argmax()) * rate.bin_us
+    return reader.read(*_around(busiest + rate.bin_us // 2, max(length, rate.bin_us)))[:_MOST_SAMPLE_EVENTS]
+
+
+def _around(center_us: int, length_us: int) -> tuple[int, int]:
+    return center_us - length_us // 2, center_us + length_us // 2 + 1
 
 
 def _write_json(target: str, reader: EventReader, statistics: EventStatistics, losses: dict[str, int]) -> None:

@@ -18,7 +18,7 @@ from devo.altcorr.windows import check_edges, split_coords
 from devo.errors import InputError
 from devo.kernels import cuda_kernel
 
-CHUNK_BYTES = 1 << 23
+CHUNK_BYTES = 1 << 22
 """Gathered features per step; larger steps fall out of the cache, smaller ones are dominated by call overhead."""
 SHAPE_STEP = 32
 """Steps hold a multiple of this many edges: matrix products of ever new sizes would be compiled again and again."""

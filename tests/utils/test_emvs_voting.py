@@ -32,15 +32,14 @@ def random_poses(rng: np.random.Generator, count: int, size: float = 0.15) -> np
 
 
 def crossings(pixels: np.ndarray, rv_T_ev: np.ndarray, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays of pixels (K, S, 2) meet the plane at `depth` of the reference view, and whether ahead of the camera."""
+    """Where rays of pixels (K, S, 2) meet the plane at `depth` of the view, and whether ahead of their camera."""
     fx, fy, cx, cy = INTRINSICS
     ray = np.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy, np.ones(pixels.shape[:2])], axis=-1)
     direction = np.einsum("kij,ksj->ksi", rv_T_ev[:, :3, :3], ray)
     center = rv_T_ev[:, None, :3, 3]
     along = (depth - center[..., 2]) / direction[..., 2]
     point = center + along[..., None] * direction
-    focal = CAMERA.focal
-    return np.stack([point[..., 0] / depth * focal + CAMERA.cx, point[..., 1] / depth * focal + CAMERA.cy], -1), along > 0
+    return point[..., :2] / depth * CAMERA.focal + [CAMERA.cx, CAMERA.cy], along > 0
 
 
 def voted_by_hand(pixels: np.ndarray, rv_T_ev: np.ndarray, depths: np.ndarray, nearest: bool = False) -> np.ndarray:
@@ -206,9 +205,24 @@ def voter_for(track: PoseTrack, planes: DepthPlanes, **options: object) -> ViewV
                      EmvsSettings(packet_size=64, **options), CPU)  # type: ignore[arg-type]
 
 
+def test_rays_of_a_point_meet_in_its_plane() -> None:
+    """20 depths, each on a plane: all rays of the point meet in that very plane and pixel, and nowhere else."""
+    planes = DepthPlanes(0.6, 3.0, 40)
+    poses = moving_track()(np.linspace(0, 1_000_000, 50))
+    for number in range(0, 40, 2):
+        depth = planes.depths[number]
+        point = CAMERA.points(np.array([20.0]), np.array([30.0]), np.array([depth]))[0]
+        seen = np.einsum("kji,kj->ki", poses[:, :3, :3], point - poses[:, :3, 3])
+        pixels = (seen[:, :2] / seen[:, 2:] * INTRINSICS[:2] + INTRINSICS[2:])[:, None]
+        dsi = votes(rays_of(pixels, poses, planes.depths))
+        assert np.unravel_index(dsi.argmax(), dsi.shape) == (number, 30, 20)
+        assert dsi.max() == pytest.approx(50, abs=0.01)
+        assert np.sort(dsi.max(axis=(1, 2)))[-2] < 49.5
+
+
 @pytest.mark.parametrize("vote", ["bilinear", "nearest"])
-def test_a_point_at_a_known_depth_peaks_in_its_plane(vote: str) -> None:
-    """20 depths, each exactly on a plane: the DSI is largest in that plane, at the pixel of the point."""
+def test_events_of_a_point_peak_at_its_depth(vote: str) -> None:
+    """The same with events, whose pixels are whole numbers: at most one plane off."""
     planes = DepthPlanes(0.6, 3.0, 40)
     track = moving_track()
     for number in range(0, 40, 2):

@@ -119,7 +119,7 @@ def test_thirty_steps_on_one_sample_halve_the_loss(tmp_path: Path) -> None:
         perturbed=0.0,
         learning_rate=5e-3,
         match_gradient_every=1,
-        loss=LossSettings(scores=0.0, pose=1.0),
+        loss=LossSettings(scores=0.0, pose=1.0, published_from=0),
     )
     losses = []
     for _ in range(30):

@@ -7,6 +7,7 @@ as packed NumPy records, never as objects: 13 bytes an event in ROS 1; in ROS 2 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import sqlite3
 import struct
 from collections.abc import Iterator
@@ -47,7 +48,7 @@ def bag_errors(path: Path) -> Iterator[None]:
     """Turn what the bag library raises on damaged bags into one `InputError` that names the bag."""
     from ruamel.yaml.error import YAMLError
 
-    damage: tuple[type[Exception], ...] = (*_bag_reader_errors(), YAMLError, *_compression_errors(), *_DAMAGE)
+    damage: tuple[type[Exception], ...] = (*_bag_reader_errors(), YAMLError, *_storage_errors(), *_DAMAGE)
     try:
         yield
     except damage as error:
@@ -215,9 +216,11 @@ def _bag_reader_errors() -> tuple[type[Exception], ...]:
     return rosbag1.ReaderError, rosbag2.ReaderError
 
 
-def _compression_errors() -> tuple[type[Exception], ...]:
-    try:
-        from backports import zstd
-    except ImportError:  # part of Python from 3.14 on
-        return ()
-    return (zstd.ZstdError,)
+def _storage_errors() -> tuple[type[Exception], ...]:
+    """Return the errors of the packages below rosbags, which depend on its version."""
+    found: list[type[Exception]] = []
+    for module_name, error_name in (("backports.zstd", "ZstdError"), ("compression.zstd", "ZstdError"),
+                                    ("apsw", "Error")):
+        with contextlib.suppress(ImportError):
+            found.append(getattr(importlib.import_module(module_name), error_name))
+    return tuple(found)

@@ -31,7 +31,7 @@ class AugmentSettings:
     reverse: float = 0.5
     mirror: float = 0.5
     upside_down: float = 0.25
-    skip_frames: float = 0.5
+    skip_frames: float = 0.35
     zoom: float = 0.0
     zoom_range: float = 0.25
     noise: float = 0.3

@@ -28,19 +28,18 @@ class LossSettings:
         fine: per update, ln(1 + error/0.2 px) of the same revised centres.
         confidence: per update, likelihood of these errors under the predicted confidence; gives the weights a meaning
             before the solver's gradients do.
-        published_from: step from which flow and pose losses count in full; they are ramped up linearly over the
-            same number of steps before.
+        published_from: flow and pose losses are left out up to this step and ramped up over as many steps after it.
     """
 
     flow: float = 0.1
-    pose: float = 10.0
+    pose: float = 4.0
     scores: float = 0.05
-    direct: float = 0.3
+    direct: float = 0.15
     direct_first: float = 2.0
     probe: float = 0.6
-    fine: float = 0.0
-    confidence: float = 0.0
-    published_from: int = 0
+    fine: float = 0.15
+    confidence: float = 0.05
+    published_from: int = 300
 
 
 @dataclass(frozen=True)
@@ -75,14 +74,14 @@ class TrainSettings:
     initial_frames: int = 8
     clips: int = 4
     sizes: tuple[tuple[int, int], ...] = ((128, 160), (112, 176), (144, 144))
-    structure_only: float = 0.1
-    perturbed: float = 0.5
+    structure_only: float = 0.0
+    perturbed: float = 0.65
     flat_depth: float = 0.7
     solver_gradient_every: int = 1
     match_gradient_every: int = 2
-    score_every: int = 1
+    score_every: int = 4
     steps: int = 10000
-    learning_rate: float = 8e-4
+    learning_rate: float = 7e-4
     warmup: int = 100
     schedule: str = "cosine"
     final_rate: float = 0.02
@@ -97,7 +96,7 @@ class TrainSettings:
     shard_clips: int = 8
     shard_frames: int = 12
     shard_size: tuple[int, int] = (144, 176)
-    reuse: int = 6
+    reuse: int = 5
     loss: LossSettings = field(default_factory=LossSettings)
     augment: AugmentSettings = field(default_factory=AugmentSettings)
 
