@@ -30,17 +30,14 @@ from devo.lietorch import SE3
 from devo.normalize import normalize_voxel
 from devo.observables import build_observables
 from devo.patchgraph import PatchGraph
-from devo.result import TrackingResult, TrackingStatus
-from devo.trajectory import FrameRecorder, full_trajectory
+from devo.result import INITIAL_KEYFRAMES, LOST_AFTER, MIN_EVENT_SHARE, TrackingResult, TrackingStatus, explain
+from devo.trajectory import FrameRecorder, accumulated_map, full_trajectory
 
-INITIAL_KEYFRAMES = 8
 INITIAL_UPDATES = 12
 FINAL_UPDATES = 12
-MIN_EVENT_SHARE = 0.02  # of voxel cells; emptier voxels cannot start a run
 PROBE_FLOW = 2.0  # quarter-resolution px of median flow that make a frame worth keeping before initialisation
 MIN_IMAGE_SIDE = 32
 EXPLAINED_PX = 4.0  # a measurement closer to its reprojection than this (quarter-resolution px) counts as explained
-LOST_AFTER = 16  # frames over which tracking must fail before a run is called lost
 _DAMPING = 1e-4
 
 
@@ -55,6 +52,7 @@ class DEVO(PatchGraph):
         viz: there is no live viewer in this package; True only warns.
         viz_flow: keep edges, reprojections and images per frame in `flow_data`.
         dim_inet, dim_fnet, dim: accepted for old callers; the network knows its dimensions.
+        save_per_frame_cloud, save_per_frame_cloud_path: the drivers in `utils.eval_utils` write these files.
         record_frame_observables: keep what `return_frame_observables` needs.
         accumulate_map: keep removed keyframes for the accumulated map.
         device: where to run; default is where the network is.
@@ -65,8 +63,13 @@ class DEVO(PatchGraph):
 
     def __init__(self, cfg: Any, network: nn.Module | str | PathLike[str], evs: bool = False, ht: int = 480,
                  wd: int = 640, viz: bool = False, viz_flow: bool = False, dim_inet: int = 384, dim_fnet: int = 128,
-                 dim: int = 32, record_frame_observables: bool = False, debug_viewer: bool = False,
-                 accumulate_map: bool = False, device: str | torch.device | None = None) -> None:
+                 dim: int = 32, save_per_frame_cloud: bool = False,
+                 save_per_frame_cloud_path: str | PathLike[str] = "results/clouds",
+                 record_frame_observables: bool = False, debug_viewer: bool = False, accumulate_map: bool = False,
+                 device: str | torch.device | None = None) -> None:
+        if save_per_frame_cloud:
+            raise InputError(f"the tracker writes no files, nothing would appear in {save_per_frame_cloud_path}; call "
+                             "utils.eval_utils.run_voxel(..., save_per_frame_cloud=True) instead")
         if viz or debug_viewer:
             warnings.warn("there is no live viewer; look at the result with scripts/view_pointcloud.py", stacklevel=2)
         self.cfg, self.evs, self.ht, self.wd = cfg, evs, ht, wd
@@ -341,6 +344,15 @@ class DEVO(PatchGraph):
         homogeneous = points[0, :, centre, centre]
         return homogeneous[:, :3] / homogeneous[:, 3:]
 
+    def get_accumulated_map(self, include_colors: bool = False) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """All structure the run ever had, `(K,3)` world points, and on request colours `(K,3)` uint8.
+
+        Raises:
+            InputError: the tracker was constructed without `accumulate_map`.
+        """
+        points, colors = accumulated_map(self)
+        return (points, colors) if include_colors else points
+
     def refine(self, updates: int = FINAL_UPDATES) -> None:
         """The extra updates at the end of a run; nothing happens before initialisation."""
         if self.is_initialized:
@@ -374,7 +386,7 @@ class DEVO(PatchGraph):
         self.counters["frames_accepted"], self.counters["keyframes"] = self.counter, self.n
         return TrackingResult(
             poses=poses, tstamps=np.array(self.tlist, dtype=np.float64), status=status,
-            message=_explain(status, self.counters, self.n),
+            message=explain(status, self.counters, self.n),
             observables=build_observables(self, include_colors) if observables else None,
             frame_data=self.frames.collect(frame_mode) if self.frames is not None and frame_mode else None,
             flowdata=self.flow_data if self.viz_flow else None,
@@ -407,18 +419,3 @@ class DEVO(PatchGraph):
 
 def _identity_pose(device: torch.device) -> Tensor:
     return torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], device=device)
-
-
-def _explain(status: TrackingStatus, counters: dict[str, int], keyframes: int) -> str:
-    """One sentence about the outcome: found, expected, what to try."""
-    accepted, read = counters["frames_accepted"], counters["frames_read"]
-    if status is TrackingStatus.EMPTY_STREAM:
-        return (f"no usable frame: {read} read, {counters['frames_too_empty']} of them with fewer than "
-                f"{MIN_EVENT_SHARE:.0%} non-zero cells; try longer windows (--window_ms, --window_events)")
-    if status is TrackingStatus.NOT_INITIALIZED:
-        return (f"not initialised: {keyframes} of {INITIAL_KEYFRAMES} keyframes with enough motion in {accepted} "
-                "frames; try longer windows, a longer recording, or trained weights")
-    if status is TrackingStatus.LOST:
-        return (f"lost: the geometry no longer explains the measurements of the last {LOST_AFTER} of {accepted} frames "
-                f"({counters['ba_failures']} failed solves); try shorter windows or check the intrinsics")
-    return f"tracked {accepted} frames with {keyframes} keyframes"

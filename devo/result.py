@@ -11,6 +11,10 @@ import numpy as np
 if TYPE_CHECKING:
     from devo.observables import Observables
 
+INITIAL_KEYFRAMES = 8
+MIN_EVENT_SHARE = 0.02  # of voxel cells; emptier voxels cannot start a run
+LOST_AFTER = 16  # frames over which tracking must fail before a run is called lost
+
 
 class TrackingStatus(enum.Enum):
     """How a run ended; everything but `TRACKED` means that the trajectory must not be used as it is."""
@@ -54,3 +58,17 @@ class TrackingResult:
     def ok(self) -> bool:
         """Whether the trajectory is usable."""
         return self.status is TrackingStatus.TRACKED
+
+def explain(status: TrackingStatus, counters: dict[str, int], keyframes: int) -> str:
+    """One sentence for people about the outcome of a run: what was found, what was expected, what to try."""
+    accepted, read = counters["frames_accepted"], counters["frames_read"]
+    if status is TrackingStatus.EMPTY_STREAM:
+        return (f"no usable frame: {read} read, {counters['frames_too_empty']} of them with fewer than "
+                f"{MIN_EVENT_SHARE:.0%} non-zero cells; try longer windows (--window_ms, --window_events)")
+    if status is TrackingStatus.NOT_INITIALIZED:
+        return (f"not initialised: {keyframes} of {INITIAL_KEYFRAMES} keyframes with enough motion in {accepted} "
+                "frames; try longer windows, a longer recording, or trained weights")
+    if status is TrackingStatus.LOST:
+        return (f"lost: the geometry no longer explains the measurements of the last {LOST_AFTER} of {accepted} frames "
+                f"({counters['ba_failures']} failed solves); try shorter windows or check the intrinsics")
+    return f"tracked {accepted} frames with {keyframes} keyframes"

@@ -123,13 +123,21 @@ def as_tuple(result: TrackingResult, return_observables: bool, return_frame_obse
 
 def _run(frames: Iterable[Frame], cfg: Config, network: NetworkLike, *, return_observables: bool,
          return_frame_observables: bool, return_colors: bool, record_frame_observables: bool = False,
-         frame_mode: str = "final", timing: bool = False, debug: bool = False, **options: Any) -> tuple[Any, ...]:
+         frame_mode: str = "final", timing: bool = False, debug: bool = False, save_per_frame_cloud: bool = False,
+         save_per_frame_cloud_path: str | PathLike[str] = "results/clouds", voxel_size: float = 0.05,
+         accumulate_map: bool = False, full_map_out: str | PathLike[str] | None = None,
+         full_map_color_out: str | PathLike[str] | None = None, **options: Any) -> tuple[Any, ...]:
     """What the three published drivers share."""
+    from utils.map_recorder import MapRecorder
+
     if return_colors and not return_observables:
         raise ValueError("return_colors needs return_observables=True")
     wants_frames = return_frame_observables or record_frame_observables
+    recorder = MapRecorder(Path(save_per_frame_cloud_path) if save_per_frame_cloud else None, voxel_size,
+                           full_map_out, full_map_color_out)
     result = track(frames, cfg, network, observables=return_observables, colors=return_colors,
-                   frame_mode=frame_mode if wants_frames else None, **options)
+                   frame_mode=frame_mode if wants_frames else None, on_frame=recorder.on_frame, on_end=recorder.on_end,
+                   accumulate_map=accumulate_map or recorder.wants_map, **options)
     if timing or debug:
         total = sum(result.timings.values())
         tqdm.write(f"{result.message}; {total:.1f} s: " + ", ".join(f"{k} {v:.1f}" for k, v in result.timings.items()))
@@ -178,15 +186,12 @@ def run_voxel(
         ValueError: `return_colors` without `return_observables`.
         InputError: unusable frames.
     """
-    from utils.map_recorder import MapRecorder
-
-    recorder = MapRecorder(Path(save_per_frame_cloud_path) if save_per_frame_cloud else None, voxel_size,
-                           full_map_out, full_map_color_out)
-    accumulate = accumulate_map or recorder.wants_map
     return _run(_frames_of(voxeldir, iterator, True), cfg, network, events=True, viz=viz, viz_flow=viz_flow, height=H,
-                width=W, scale=scale, timing=timing, debug=debug, accumulate_map=accumulate,
-                on_frame=recorder.on_frame, on_end=recorder.on_end, return_observables=return_observables,
-                return_frame_observables=return_frame_observables, return_colors=return_colors, **kwargs)
+                width=W, scale=scale, timing=timing, debug=debug, save_per_frame_cloud=save_per_frame_cloud,
+                save_per_frame_cloud_path=save_per_frame_cloud_path, voxel_size=voxel_size,
+                accumulate_map=accumulate_map, full_map_out=full_map_out, full_map_color_out=full_map_color_out,
+                return_observables=return_observables, return_frame_observables=return_frame_observables,
+                return_colors=return_colors, **kwargs)
 
 
 def run_rgb(

@@ -50,9 +50,11 @@ def corr_features(
         InputError: shapes or dtypes do not fit together.
     """
     levels, edges, patch, side = len(pyramid), len(kk), gmap.shape[-1], 2 * radius + 1
-    if not levels or any(level.dtype != gmap.dtype or level.shape[:3] != pyramid[0].shape[:3] for level in pyramid):
+    maps = (1, pyramid[0].shape[1], gmap.shape[2]) if levels else ()
+    if not levels or any(level.dtype != gmap.dtype or level.shape[:3] != maps for level in pyramid):
         found = ", ".join(f"{tuple(level.shape)} {level.dtype}" for level in pyramid) or "nothing"
-        raise InputError(f"corr_features got the pyramid {found}; expected equal frames, channels and {gmap.dtype}")
+        expected = f"(1, F, {gmap.shape[2]}, height, width) {gmap.dtype} with the same F"
+        raise InputError(f"corr_features got the pyramid {found}; expected levels {expected}")
     check_edges("corr_features", coords, kk, jj, patch)
     out = gmap.new_empty(edges, side, side, patch * patch, levels)
     with torch.no_grad(), torch.autocast(gmap.device.type, enabled=False):

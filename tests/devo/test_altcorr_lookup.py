@@ -194,6 +194,8 @@ def test_features_refuse_unequal_inputs() -> None:
         corr_features(gmap.half(), pyramid, coords, kk, jj)
     with pytest.raises(InputError, match="corr_features got the pyramid"):
         corr_features(gmap, (pyramid[0], pyramid[1][:, :4]), coords, kk, jj)
+    with pytest.raises(InputError, match="expected levels"):
+        corr_features(gmap[:, :, :8], pyramid, coords, kk, jj)
     with pytest.raises(InputError, match="corr_features got coords"):
         corr_features(gmap, pyramid, coords[:, 1:], kk, jj)
 

@@ -214,6 +214,7 @@ def test_accumulated_map_holds_keyframes_and_removed_ones(tracked: tuple) -> Non
     points, colors = accumulated_map(tracker)
     expected = (tracker.n + tracker.counters["keyframes_dropped"]) * tracker.M
     assert points.shape == (expected, 3) and colors.shape == (expected, 3)
+    assert len(tracker.get_accumulated_map()) == expected
     plain, _ = make_tracker()
     with pytest.raises(InputError, match="accumulate_map"):
         accumulated_map(plain)

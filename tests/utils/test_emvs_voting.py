@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from devo.errors import InputError
+from evals.benchmark_emvs import measure
 from utils.emvs.depth_map import extract_depth
 from utils.emvs.geometry import DepthPlanes, PacketRays, VirtualCamera, packet_rays, usable_packets
 from utils.emvs.mapper import EventCamera, ViewVoter
@@ -272,6 +273,25 @@ def test_scaling_poses_and_depths_changes_nothing(scale: float, seed: int) -> No
         results.append((voter.dsi.numpy(), extract_depth(voter.dsi, planes, voter.settings).mask))
     np.testing.assert_allclose(results[0][0], results[1][0], atol=5e-3)
     assert np.mean(results[0][1] != results[1][1]) < 2e-3
+
+
+def test_a_packet_has_the_pose_of_its_middle_event() -> None:
+    voter = voter_for(moving_track(), DepthPlanes(0.6, 3.0, 5))
+    asked = []
+    track = voter.track
+    voter.track = lambda t_us: asked.extend(t_us) or track(t_us)  # type: ignore[assignment, func-returns-value]
+    t_us = np.arange(0, 1000 * 153, 1000)
+    voter.add(make_events(np.full(153, 5), np.full(153, 5), t_us, np.ones(153)))
+    voter.finish()
+    assert asked == [32_000, 96_000, 140_000]  # packets of 64, 64 and 25 events
+    assert voter.counts["packets"] == 3
+
+
+def test_the_benchmark_compares_equal_votes() -> None:
+    rows = measure("64x48", 4096, 6, [1], 1)
+    assert {row["implementation"] for row in rows} == {"numpy add.at", "numpy add.at by plane", "numpy add.at flat",
+                                                       "numpy bincount", "utils.emvs"}
+    assert 0 < rows[0]["largest_difference_votes"] < 1e-3 and all(row["mvotes_per_s"] > 0 for row in rows)
 
 
 def test_an_event_outside_the_sensor_is_an_error() -> None:

@@ -36,7 +36,9 @@ def assert_one_line(error: InputError, path: Path) -> None:
     (b"PK\x03\x04 but not a zip archive", "damaged or truncated npz"),
     (b"\x93NUMPY\x01\x00", "damaged or truncated npy"),
     (b"\x89HDF\r\n\x1a\n and nothing else", "damaged or unreadable HDF5"),
-    (b"#ROSBAG V2.0\n", "a ROS 1 bag"),
+    (b"#ROSBAG V2.0\n", "damaged or unreadable bag"),
+    (b"% evt 3.0\n", "holds no events"),
+    (b"#!AER-DAT3.1\n", "AEDAT version '3.1'"),
     (b"hello world\n", "line 1: 2 columns"),
 ])
 def test_files_that_are_no_events(content: bytes, message: str, tmp_path: Path) -> None:

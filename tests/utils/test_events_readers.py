@@ -120,13 +120,6 @@ def test_npy_records_of_a_prophesee_decoder(shared_data: Path) -> None:
         assert np.array_equal(Events.concatenate(list(reader.chunks())).t_us, reference["t"])
 
 
-def test_prophesee_raw_is_refused_by_name(shared_data: Path) -> None:
-    with pytest.raises(InputError, match="Prophesee RAW.*convert it first"):
-        open_events(shared_data / "prophesee_raw" / "evt3_sample.raw")
-    with pytest.raises(InputError, match="AEDAT"):
-        open_events(shared_data / "aestream_davis346" / "davis.aedat4")
-
-
 def test_sensor_size_of_the_file_is_used_and_checked(tmp_path: Path) -> None:
     write_events_h5(tmp_path / "e.h5", make_events([5, 6], [1, 1], [0, 1], [0, 1]), sensor_size=(7, 3))
     with open_events(tmp_path / "e.h5") as reader:

@@ -17,7 +17,8 @@ from devo.device import resolve_device
 from devo.errors import DevoError, InputError
 from utils.calibration import read_calibration
 from utils.clouds.io import read_cloud
-from utils.datasets import SequenceOptions, open_sequence
+from utils.datasets.generic import CALIBRATION_NAMES, find_event_file
+from utils.datasets.options import SequenceOptions
 from utils.emvs.convention import ConventionCheck, PacketSample, check_convention
 from utils.emvs.mapper import EmvsMap, EventCamera, map_events
 from utils.emvs.products import base_path, write_products
@@ -116,16 +117,29 @@ def _find_files(options: EmvsOptions) -> dict[str, Path]:
     """Events, poses and calibration: as given, the rest from the folder of a generic recording."""
     given = {name: Path(value) for name in ("events", "poses", "calib") if (value := getattr(options, name))}
     if options.datapath is not None:
-        sequence = open_sequence("generic", given.get("events", Path(options.datapath)), SequenceOptions(
-            calib=given.get("calib"), image_size=options.size))
-        found = sequence.describe()["files"]
-        roles = {"events": "events", "poses": "ground truth", "calib": "calibration"}
-        given = {name: Path(found[role]) for name, role in roles.items() if role in found} | given
+        given = _files_of_folder(Path(options.datapath), given) | given
     missing = [f"--{name}" for name in ("events", "poses", "calib") if name not in given]
     if missing:
         where = f"{options.datapath} has no such file" if options.datapath else "or give --datapath FOLDER"
         raise InputError(f"{' and '.join(missing)} needed: {where}")
     return given
+
+
+def _files_of_folder(folder: Path, given: dict[str, Path]) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise InputError(f"--datapath {folder} is no folder; expected one with events.*, calib.* and groundtruth.txt")
+    found = {}
+    if "events" not in given:
+        found["events"] = find_event_file(folder, SequenceOptions())
+    calibrations = [folder / name for name in CALIBRATION_NAMES if (folder / name).is_file()]
+    if len(calibrations) > 1 and "calib" not in given:
+        raise InputError(f"{folder}: several calibrations ({', '.join(file.name for file in calibrations)}); pass the "
+                         "one to use with --calib")
+    if calibrations:
+        found["calib"] = calibrations[0]
+    if (folder / "groundtruth.txt").is_file():
+        found["poses"] = folder / "groundtruth.txt"
+    return found
 
 
 def _size_in(events: Path) -> tuple[int, int] | None:

@@ -13,6 +13,7 @@ from utils.emvs.settings import EmvsSettings
 from utils.trajectory_io import Trajectory
 
 FloatArray = npt.NDArray[np.float64]
+_LEAST_COVERAGE = 1e-3  # of the events' time; seconds read as microseconds cover 1e-6
 
 
 class PoseTrack:
@@ -86,13 +87,17 @@ def common_span(track: PoseTrack, first_us: float, last_us: float) -> tuple[floa
         first_us, last_us: stamps of the first and last event of the window.
 
     Raises:
-        InputError: they share no time.
+        InputError: they share no time, or so little that the stamps must be in different units.
     """
     start, stop = max(first_us, track.t_us[0]), min(last_us, track.t_us[-1])
     if not start < stop:
         raise InputError(f"poses span {track.t_us[0]:.0f} us to {track.t_us[-1]:.0f} us, events {first_us:.0f} us to "
                          f"{last_us:.0f} us: they do not overlap; check the unit of the pose stamps (--pose_format), "
                          "the clocks and --start_time_s / --stop_time_s")
+    if stop - start < _LEAST_COVERAGE * (last_us - first_us):
+        raise InputError(f"poses span {track.t_us[0]:.6g} us to {track.t_us[-1]:.6g} us, only "
+                         f"{100 * (stop - start) / (last_us - first_us):.5f} % of the time of the events; check the "
+                         "unit of the pose stamps (--pose_format)")
     return float(start), float(stop)
 
 

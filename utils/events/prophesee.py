@@ -19,6 +19,7 @@ _BLOCK_BYTES = 1 << 18  # the work arrays of one block stay in the processor's c
 _LONGEST_HEADER = 1 << 16
 _OUTSIDE = "events outside the sensor"
 _CUT_OFF = "incomplete words"
+_LARGEST_SENSOR = (2048, 2048)  # all encodings have 11 bits for columns and rows
 # Older headers name the camera but not its size.
 _SENSOR_OF_PLUGIN = (("gen41", (1280, 720)), ("gen4", (1280, 720)), ("imx636", (1280, 720)),
                      ("genx320", (320, 320)), ("gen3", (640, 480)))
@@ -168,9 +169,9 @@ class RawEventReader(LossyReader):
     def _inside(self, decoded: Decoded, lost: Counter[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the columns of the events inside the sensor."""
         columns = decoded.x, decoded.y, decoded.t_us, decoded.p
-        if self.sensor_size is None or not len(decoded.x):
+        if not len(decoded.x):
             return columns
-        width, height = self.sensor_size
+        width, height = self.sensor_size or _LARGEST_SENSOR
         if int(decoded.x.max()) < width and int(decoded.y.max()) < height:
             return columns
         inside = (decoded.x < width) & (decoded.y < height)

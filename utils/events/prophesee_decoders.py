@@ -153,8 +153,9 @@ def _vector_tables() -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.
 
 
 _EVENTS_IN_VECTOR, _FIRST_BIT_OF_VECTOR, _BITS_OF_VECTOR = _vector_tables()
-_ADVANCE = np.array([0, 0, 0, 0, 12, 8], np.int64)
-_KNOWN_EVT3 = np.isin(np.arange(16), (0, 2, 3, 4, 5, 6, 7, 8, 10, 14, 15))
+_FAR_RIGHT = 0xFFF  # outside every sensor: vectors without a new base run out of the 11 bits of a column
+_ADVANCE = np.array([0, 0, 0, 0, 12, 8], np.int32)
+_UNKNOWN_EVT3 = (1, 9, 11, 12, 13)
 
 
 class Evt3Decoder:
@@ -195,7 +196,7 @@ class Evt3Decoder:
         start = max(0 if state.y is not None else int(events_before[rows[0]]) if len(rows) else len(x),
                     0 if state.t_us is not None else int(events_before[says[0]]) if len(says) else len(x))
         lost[EARLY] += start
-        lost[UNKNOWN] += len(at) - int(np.count_nonzero(_KNOWN_EVT3[special.kind]))
+        lost[UNKNOWN] += sum(int(np.count_nonzero(special.kind == unknown)) for unknown in _UNKNOWN_EVT3)
         behind = State(ticks, int(stamps[-1]) if len(stamps) else state.t_us,
                        int(row_values[-1]) if len(rows) else state.y, base_x, polarity)
         return Decoded(x[start:], y[start:], t_us[start:], p[start:], behind, +lost)
@@ -238,12 +239,12 @@ class Evt3Decoder:
         word, kind = special.word[group], special.kind[group]
         bases = np.flatnonzero(kind == 3)
         advance = _ADVANCE[kind]
-        moved = np.cumsum(advance)  # by the vectors up to here
-        base = word[bases].astype(np.int64)
+        moved = np.cumsum(advance, dtype=np.int32)  # by the vectors up to here
+        base = word[bases].astype(np.int32)
         # Column before all moves and polarity, in one number so that they are spread together.
         origin = ((base & 0x7FF) - moved[bases]) * 2 + (base >> 11 & 1)
         origin = _spread(origin, bases, 2 * state.base_x + state.polarity, len(group))
-        behind = int(origin[-1] >> 1) + int(moved[-1]) & 0x7FF, int(origin[-1] & 1)
+        behind = min(int(origin[-1] >> 1) + int(moved[-1]), _FAR_RIGHT), int(origin[-1] & 1)
 
         filled = np.flatnonzero((kind != 3) & ((word & 0xFFF) != 0))
         code = word[filled] & 0x1FFF
@@ -261,7 +262,7 @@ class Evt3Decoder:
         is_free = np.ones(len(merged), bool)
         is_free[place] = False
         merged[np.flatnonzero(is_free)] = events
-        merged[place] = (column & 0xFFF) | (origin[filled] & 1)[source] << 15
+        merged[place] = np.minimum(column, _FAR_RIGHT) | (origin[filled] & 1)[source] << 15
         return merged, *behind
 
 

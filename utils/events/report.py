@@ -90,9 +90,11 @@ def _draw_slice(axes: Any, statistics: EventStatistics, sample: Events) -> None:
     width, height = statistics.size
     picture = np.zeros((2, height, width))
     np.add.at(picture, (sample.p.astype(np.intp), sample.y.astype(np.intp), sample.x.astype(np.intp)), 1.0)
-    strength = 1 - np.exp(-picture)
-    color = strength[1][..., None] * np.array(_BRIGHTER) + strength[0][..., None] * np.array(_DARKER)
-    axes.imshow(np.clip(color + 0.06, 0, 1), interpolation="nearest", aspect="equal")
+    total = picture.sum(axis=0)
+    share = (picture[1] / np.maximum(total, 1))[..., None]
+    color = share * np.array(_BRIGHTER) + (1 - share) * np.array(_DARKER)
+    strength = 1 - np.exp(-total)[..., None]
+    axes.imshow(np.clip(color * strength + 0.06, 0, 1), interpolation="nearest", aspect="equal")
     span = (int(sample.t_us[-1]) - int(sample.t_us[0])) * 1e-3 if len(sample) else 0.0
     since = (int(sample.t_us[0]) - statistics.first_us) * 1e-6 if len(sample) else 0.0
     _label(axes, f"{len(sample):,} events in {span:.2f} ms, {since:.3f} s after the start (blue brighter, red darker)",

@@ -12,10 +12,9 @@ from utils.events.types import Events
 
 _MOST_BINS = 1024
 _LONGEST_GAPS = 5
-# A hot pixel fires this many times as often as most of its neighbourhood, and far more than the average pixel. The
-# percentile keeps thin bright edges out: a line two pixels wide fills 40 % of a 5x5 window.
+# A hot pixel fires this many times as often as all but one of the pixels around it, and far more than the average
+# pixel. All but one, because hot pixels come in pairs too, and lines, with their ends, have more bright pixels.
 _HOT_FACTOR = 8.0
-_HOT_PERCENTILE = 80.0
 _HOT_STANDARD_DEVIATIONS = 3.0
 _HOT_LEAST_EVENTS = 10
 
@@ -118,10 +117,10 @@ class EventStatistics:
         return Rate(self._bin_us, self._bins.sum(axis=0)[:used], self._bins[1, :used])
 
     def hot_pixels(self) -> list[HotPixel]:
-        """Pixels that fire 8 times as often as 80 % of the 5x5 around them and 3 sigma more than the mean, sorted."""
+        """Pixels that fire 8 times as often as all but one of the 5x5 around them and 3 sigma above the mean."""
         if not self._counts.size:
             return []
-        around = scipy.ndimage.percentile_filter(self._counts, _HOT_PERCENTILE, size=5, mode="reflect")
+        around = scipy.ndimage.rank_filter(self._counts, -3, size=5, mode="constant", cval=0)
         least = max(self._counts.mean() + _HOT_STANDARD_DEVIATIONS * self._counts.std(), _HOT_LEAST_EVENTS)
         rows, columns = np.nonzero((self._counts > _HOT_FACTOR * around) & (self._counts >= least))
         found = [HotPixel(int(x), int(y), int(self._counts[y, x])) for x, y in zip(columns, rows)]
@@ -134,13 +133,10 @@ class EventStatistics:
         if (smallest := int(steps.min())) < 0:
             self.backward_steps += int(np.count_nonzero(steps < 0))
             self.largest_backward_us = max(self.largest_backward_us, -smallest)
-        long = np.flatnonzero(steps >= self.gap_us)
-        self.gap_count += len(long)
-        if len(steps) > _LONGEST_GAPS:
-            long = np.argpartition(steps, -_LONGEST_GAPS)[-_LONGEST_GAPS:]
-        else:
-            long = np.arange(len(steps))
-        gaps = [Gap(int(t_us[i] - steps[i]), int(steps[i]), self.events + int(i)) for i in long if steps[i] > 0]
+        self.gap_count += int(np.count_nonzero(steps >= self.gap_us))
+        least = max(int(np.partition(steps, -_LONGEST_GAPS)[-_LONGEST_GAPS]), 1) if len(steps) > _LONGEST_GAPS else 1
+        candidates = [*np.flatnonzero(steps > least), *np.flatnonzero(steps == least)[:_LONGEST_GAPS]]
+        gaps = [Gap(int(t_us[i] - steps[i]), int(steps[i]), self.events + int(i)) for i in candidates]
         self._gaps = sorted(self._gaps + gaps, key=lambda gap: (-gap.length_us, gap.event))[:_LONGEST_GAPS]
         self._previous_us = int(t_us[-1])
 
