@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             statistics.add(piece)
         if not statistics.events:
             raise InputError(f"{path}: the file holds no events")
-        losses = getattr(reader, "losses", {})
+        losses = reader.losses
         print(path)
         for heading, sentence in describe(statistics, format_name=reader.format_name, losses=losses,
                                           size_is_known=reader.sensor_size is not None):

@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with open_events(source, on_unsorted="sort" if options.sort else "error", **reading_options(options)) as reader:
         counter = _Counter()
         _write(target, reader, counter.count(_cropped(reader, options.start, options.stop)), options.compression)
-        lost = sum(getattr(reader, "losses", {}).values())
+        lost = sum(reader.losses.values())
         print(f"{target}: {counter.events:,} events, {counter.duration_us * 1e-6:.6f} s, from {reader.format_name}"
               + (f"; {lost:,} damaged parts were left out" if lost else ""))
     return 0

@@ -59,6 +59,11 @@ SIMULATOR_SURFACE = 3e-6  # back-projected depth, distance from the scene over t
 SIMULATOR_CROSSING = 1e-5  # log intensity at the time of an event against a float64 pixel; observed 1.7e-6
 SIMULATOR_VOXEL = 1e-5  # voxel cells against float64 binning of listed events; observed 1.4e-6
 
+# --- EMVS ---------------------------------------------------------------------------------------------------
+EMVS_VOTES = 3e-5  # per voxel, float32 positions against float64 rays; 7.4e-6 (24 draws)
+EMVS_VOTES_NEAR_PLANES = 2e-4  # the same with cameras among the planes; 5.2e-5 (12 draws)
+EMVS_PIXELS = 5e-5  # event -> plane -> event; 1.5e-5
+
 # --- training -----------------------------------------------------------------------------------------------
 CORRELATION_VOLUME = 1e-4  # volume against direct correlation, values up to 40 and gradients; observed 1e-5
 JOINED_CLIPS = 1e-3  # joined against single clips after 4 updates, pixels and poses; observed below 1e-4

@@ -75,7 +75,8 @@ def test_convert_sorts_on_request(repository: Path, tmp_path: Path) -> None:
     rows = np.random.default_rng(4).permutation(300)
     write_events_text(tmp_path / "e.txt", Events(events.x[rows], events.y[rows], events.t_us[rows], events.p[rows]))
     assert "time stamps are not sorted" in one_line(run(repository, tmp_path, CONVERT, "e.txt", "e.npz"), 2)
-    assert run(repository, tmp_path, CONVERT, "e.txt", "e.npz", "--sort").returncode == 0
+    done = run(repository, tmp_path, CONVERT, "e.txt", "e.npz", "--sort")
+    assert done.stdout.endswith("from text t x y p (sorted)\n"), done.stderr
     assert np.array_equal(read(tmp_path / "e.npz").t_us, events.t_us)
 
 
@@ -112,7 +113,7 @@ def test_check_draws_and_reports(repository: Path, tmp_path: Path) -> None:
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500  # not an empty canvas
 
 
-def test_check_ends_with_1_if_the_recording_needs_attention(repository: Path, tmp_path: Path) -> None:
+def test_check_ends_with_1_if_stamps_run_backwards(repository: Path, tmp_path: Path) -> None:
     events = random_events(500, seed=7)
     t_us = events.t_us.copy()
     t_us[100] = 0
@@ -121,6 +122,10 @@ def test_check_ends_with_1_if_the_recording_needs_attention(repository: Path, tm
     assert done.returncode == 1, done.stderr
     assert "NOT sorted: 1 stamps run backwards" in done.stdout
     assert (tmp_path / "sub/p.png").is_file()
+
+
+def test_check_ends_with_1_if_parts_are_damaged(repository: Path, tmp_path: Path) -> None:
+    events = random_events(500, seed=7)
     (tmp_path / "e.raw").write_bytes(HEADER_EVT3 + encode_evt3(events) + b"\x00")
     done = run(repository, tmp_path, CHECK, "e.raw", "--no-picture")
     assert done.returncode == 1

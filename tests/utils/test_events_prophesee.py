@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -300,7 +301,7 @@ def test_losses_are_counted_and_warned_about_once(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"e\.raw: 2 words of unknown type left out in bytes") as caught, \
             open_events(path) as reader:
         assert same(reader.read(0, 10**9), events)
-        assert reader.losses == {"words of unknown type": 2}  # type: ignore[attr-defined]
+        assert reader.losses == {"words of unknown type": 2}
     assert len(caught) == 1
 
 
@@ -410,6 +411,22 @@ def test_500_flipped_bytes_from_the_first_byte_on(name: str, raw_folder: Path, t
             assert "e.raw" in str(error)
 
 
+@settings(max_examples=150, deadline=None)
+@given(header=st.sampled_from([b"% evt 3.0\n", HEADER_EVT3, HEADER_EVT2, b"% evt 2.1\n"]),
+       data=st.binary(min_size=1, max_size=600), block=st.sampled_from([8, 64, 1 << 18]))
+def test_random_bytes_never_crash(tmp_path_factory: pytest.TempPathFactory, header: bytes, data: bytes,
+                                  block: int) -> None:
+    path = write_raw(tmp_path_factory.mktemp("raw") / "e.raw", header, data)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prophesee, "_BLOCK_BYTES", block)
+        try:
+            events, _ = read(path)
+        except InputError as error:
+            assert "\n" not in str(error)
+        else:
+            assert np.all(np.diff(events.t_us) >= 0)
+
+
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_truncation_anywhere(encoding: Encoding, tmp_path: Path) -> None:
     """What remains are the first events; a word that is cut in two is reported."""
@@ -426,3 +443,22 @@ def test_truncation_anywhere(encoding: Encoding, tmp_path: Path) -> None:
         else:
             assert same(found, events[:len(found)])
             assert losses.get("incomplete words", 0) == (length % size != 0)
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
+    """The words of 100 ms, repeated with the coarse counter moved on: 2 s take as little memory as 0.2 s."""
+    events = random_events(30_000, seed=21, longest_gap_us=6)
+    words = np.frombuffer(encode_evt3(events, repeat_time_high=16), "<u2")
+    is_high = words >> 12 == 8
+    span = int(events.t_us[-1] >> 12) + 1
+    peaks = []
+    for repeats in (6, 60):
+        parts = [np.where(is_high, words + np.uint16(i * span), words) for i in range(repeats)]
+        path = write_raw(tmp_path / "e.raw", b"% evt 3.0\n", np.concatenate(parts).tobytes())
+        with open_events(path) as reader:
+            tracemalloc.start()
+            count = sum(len(piece) for piece in reader.chunks())
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        assert count == repeats * len(events)
+    assert peaks[1] < 1.2 * peaks[0]

@@ -178,7 +178,8 @@ def map_events(reader: EventReader, trajectory: Trajectory, event_camera: EventC
     """Build depth maps and a cloud from events with known poses.
 
     Time without poses is left out and counted. Memory: one DSI of dimZ x dimY x dimX float32 and a few blocks of
-    events. The same input gives the same bytes on the CPU; on CUDA the order of additions, and so the last digit, varies.
+    events. The same input gives the same bytes on the CPU; on CUDA the order of additions varies, and with it the last
+    digit.
 
     Args:
         reader: the events.

@@ -49,6 +49,11 @@ class EventReader(abc.ABC):
     def time_range_us(self) -> tuple[int, int]:
         """Return the stamps of the first and of the last event in microseconds."""
 
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out of the part read so far: reason -> count; only streams that may be damaged lose events."""
+        return {}
+
     @abc.abstractmethod
     def _decode(self, block: int) -> Events | None:
         """Return the checked events of one block, None behind the last block."""
@@ -196,17 +201,24 @@ class MemoryEventReader(RowReader):
         events: checked, sorted events.
         path: what to call them in messages.
         sensor_size: (width, height) in pixels or None.
+        losses: what the reader that the events come from left out.
     """
 
     format_name = "memory"
 
     def __init__(self, events: Events, path: str | os.PathLike[str] = "memory",
-                 sensor_size: tuple[int, int] | None = None) -> None:
+                 sensor_size: tuple[int, int] | None = None, losses: dict[str, int] | None = None) -> None:
         super().__init__(Path(path), sensor_size, "error")
         if not len(events):
             raise InputError(f"{path}: there are no events")
         self.events = events
         self.rows = len(events)
+        self._losses = losses or {}
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out when the events were read."""
+        return self._losses
 
     def _columns(self, first: int, last: int) -> tuple[Column, Column, np.ndarray, Column]:
         part = self.events[first:last]
@@ -374,4 +386,6 @@ def _sorted_in_memory(reader: EventReader) -> EventReader:
     if np.any(events.t_us[1:] < events.t_us[:-1]):
         rows = np.argsort(events.t_us, kind="stable")
         events = Events(events.x[rows], events.y[rows], events.t_us[rows], events.p[rows])
-    return MemoryEventReader(events, reader.path, reader.sensor_size)
+    result = MemoryEventReader(events, reader.path, reader.sensor_size, reader.losses)
+    result.format_name = f"{reader.format_name} (sorted)"
+    return result
