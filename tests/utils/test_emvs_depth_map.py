@@ -70,10 +70,10 @@ def test_to_bytes() -> None:
     np.testing.assert_array_equal(to_bytes(np.full((2, 2), 7.0, np.float32)), np.zeros((2, 2)))
 
 
-def dsi_with_dots(planes: int = 10) -> torch.Tensor:
-    """Dots of 9 votes, all in plane 6, on a 20 x 16 image."""
+def dsi_with_dots(planes: int = 10, row: int = 1, column: int = 1) -> torch.Tensor:
+    """Dots of 9 votes in every third row and column, all in plane 6, on a 20 x 16 image."""
     dsi = torch.zeros(planes, 16, 20)
-    dsi[6, 1::3, 1::3] = 9.0
+    dsi[6, row::3, column::3] = 9.0
     return dsi
 
 
@@ -87,6 +87,18 @@ def test_depth_map_by_hand() -> None:
     np.testing.assert_allclose(found.depth[found.mask], 1 / (1 / 3 + 0.6 * 2 / 3), rtol=1e-6)
     np.testing.assert_array_equal(found.confidence[found.mask], 9)
     assert found.depth.dtype == found.confidence.dtype == np.float32
+
+
+def test_border() -> None:
+    """Up to 2 at the low ends, from 2 before the end at the high ones; each pixel is a dot once."""
+    believed = np.zeros((16, 20), bool)
+    for row in range(3):
+        for column in range(3):
+            dsi = dsi_with_dots(row=row, column=column)
+            believed |= extract_depth(dsi, DepthPlanes(1.0, 3.0, 10), EmvsSettings()).mask
+    expected = np.zeros((16, 20), bool)
+    expected[3:14, 3:18] = True
+    np.testing.assert_array_equal(believed, expected)
 
 
 def test_the_first_plane_wins_a_tie_and_no_votes_give_no_depth() -> None:
