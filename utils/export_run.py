@@ -35,6 +35,7 @@ from utils.export_products import (
 )
 from utils.map_recorder import MapRecorder
 
+MAX_RELATIVE_SIGMA = 0.1  # cleaned clouds keep depths that are known to ten per cent
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULT_CONFIG = {"fpv": "eval_fpv.yaml", "rpg": "eval_rpg.yaml", "vector": "eval_vector.yaml"}
 
@@ -89,9 +90,10 @@ class ExportOptions:
 
     def cleanup_steps(self) -> list[str | tuple[str, dict[str, Any]]]:
         """Quality first, then the chosen outlier filter."""
+        quality = ("quality", {"max_relative_sigma": MAX_RELATIVE_SIGMA})
         if self.cleanup_algo == "ror":
-            return ["quality", ("ror", {"radius": self.ror_radius, "min_neighbors": self.ror_min_neighbors})]
-        return ["quality", ("sor", {"neighbors": self.sor_nb_neighbors, "std_ratio": self.sor_std_ratio})]
+            return [quality, ("ror", {"radius": self.ror_radius, "min_neighbors": self.ror_min_neighbors})]
+        return [quality, ("sor", {"neighbors": self.sor_nb_neighbors, "std_ratio": self.sor_std_ratio})]
 
 
 def find_config(name: str | None, dataset: str, weights: str = "") -> Path:
@@ -196,7 +198,7 @@ def _write_clouds(products: Products, result: TrackingResult, options: ExportOpt
     reports: list[FilterReport] = []
     if options.cleanup:
         cloud, reports = write_cleaned(products, cloud, options.cleanup_steps())
-    write_preview(products, cloud, result.poses, f"{products.base.name}: {len(cloud)} points, scale arbitrary")
+    write_preview(products, cloud, result.poses, products.base.name)
     return cloud, reports
 
 
