@@ -198,7 +198,9 @@ def _write_clouds(products: Products, result: TrackingResult, options: ExportOpt
     reports: list[FilterReport] = []
     if options.cleanup:
         cloud, reports = write_cleaned(products, cloud, options.cleanup_steps())
-    write_preview(products, cloud, result.poses, products.base.name)
+    shown, title = (cloud, products.base.name) if len(cloud) else (
+        observables_to_cloud(result.observables), f"{products.base.name} (raw: no point passed the cleaning)")
+    write_preview(products, shown, result.poses, title)
     return cloud, reports
 
 
