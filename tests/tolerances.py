@@ -39,8 +39,8 @@ ENCODER_BFLOAT16 = 0.05  # bfloat16 against float32 feature maps, of their large
 NORMALIZE = 2e-6  # against float64; observed 2.6e-7
 
 # --- tracker ------------------------------------------------------------------------------------------------
-TRACKER_ORACLE_POSES = 5e-3  # a change of 1e-6 in the initial inverse depths moves the reference by 1.2e-3
-TRACKER_ORACLE_POINTS = 1e-2  # of the depth
+TRACKER_ORACLE_POSES = 5e-3  # 1.9e-4; a change of 1e-6 in the initial depths moves the reference by 1.2e-3
+TRACKER_ORACLE_POINTS = 1e-2  # of the depth; 2.0e-4
 
 # --- events and voxel grids ---------------------------------------------------------------------------------
 VOXEL = 1e-6  # absolute, per cell; worst 2.3e-7, one rounding to float32 of cells up to 4
