@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from os import PathLike
 from pathlib import Path
@@ -64,8 +66,8 @@ def track(
     """
     cfg = cfg.clone()
     tracker: DEVO | None = None
-    interrupted = False
-    with torch.no_grad(), _seeded(seed), tqdm(total=total, disable=not progress, unit="frame", desc="track") as bar:
+    bar = tqdm(total=total, disable=not progress, unit="frame", desc="track")
+    with torch.no_grad(), _seeded(seed), bar, _interrupts(keep_on_interrupt) as interrupt:
         try:
             for image, intrinsics, t_us in frames:
                 if tracker is None:
@@ -77,18 +79,43 @@ def track(
                     on_frame(tracker)
                 bar.update()
                 bar.set_postfix(keyframes=tracker.n, refresh=False)
-        except KeyboardInterrupt:
+                if interrupt.is_set():
+                    break
+        except KeyboardInterrupt:  # from the stream itself: between two frames, so the tracker is whole
             if not keep_on_interrupt:
                 raise
-            interrupted = True
+            interrupt.set()
         if tracker is None:
-            return _nothing(interrupted)
+            return _nothing(interrupt.is_set())
         tracker.refine()
         if on_end is not None:
             on_end(tracker)
         result = tracker.result(observables=observables, include_colors=colors, frame_mode=frame_mode)
-    result.counters["interrupted"] = int(interrupted)
+    result.counters["interrupted"] = int(interrupt.is_set())
     return result
+
+
+@contextlib.contextmanager
+def _interrupts(deferred: bool) -> Iterator[threading.Event]:
+    """Yield an event; if `deferred`, the first Ctrl-C sets it instead of tearing a frame apart, the second one raises.
+
+    Signals can only be handled in the main thread; elsewhere nothing is deferred.
+    """
+    event = threading.Event()
+    if not deferred or threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def note(*_: object) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 @contextlib.contextmanager

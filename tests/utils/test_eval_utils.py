@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -111,6 +113,25 @@ def test_ctrl_c_keeps_what_exists(oracle: tuple) -> None:
     assert result.counters["interrupted"] == 1 and len(result.poses) == 17
     with pytest.raises(KeyboardInterrupt):
         drivers.track(interrupted(), cfg, network)
+
+
+def test_ctrl_c_in_the_middle_of_a_frame_waits_for_its_end(oracle: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real signal while edges are being appended: the frame is finished, the result is whole."""
+    scene, network, cfg = oracle
+    original, calls = OracleTracker.append_factors, []
+
+    def append(self: OracleTracker, *arguments: torch.Tensor) -> None:
+        calls.append(1)
+        if len(calls) == 23:
+            os.kill(os.getpid(), signal.SIGINT)
+        original(self, *arguments)
+
+    monkeypatch.setattr(OracleTracker, "append_factors", append)
+    before = signal.getsignal(signal.SIGINT)
+    result = drivers.track(scene.frames(), cfg, network, keep_on_interrupt=True)
+    assert result.counters["interrupted"] == 1 and 8 < len(result.poses) < FRAMES
+    assert result.ok and np.isfinite(result.poses).all()
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_an_empty_stream_is_a_status(oracle: tuple) -> None:
