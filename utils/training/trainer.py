@@ -159,7 +159,7 @@ class Trainer:
         final = min(settings.steps, run.stop_after) if run.stop_after is not None else settings.steps
         reason = "all steps done"
         while self.step < final:
-            if run.minutes is not None and time.monotonic() - started > 60 * run.minutes:
+            if run.minutes is not None and self._agreed(time.monotonic() - started > 60 * run.minutes):
                 reason = f"time limit of {run.minutes:g} minutes reached"
                 break
             values = self.train_step()
@@ -186,6 +186,14 @@ class Trainer:
         self.save(run.folder / "last.pth", time.monotonic() - started)
         self.trained_seconds += time.monotonic() - started
         return reason
+
+    def _agreed(self, stop: bool) -> bool:
+        """What the first process wants, in all processes: none may leave while others still wait for its gradients."""
+        if self.world == 1:
+            return stop
+        flag = torch.tensor([float(stop)], device=self.device)
+        torch.distributed.broadcast(flag, 0)
+        return bool(flag.item())
 
     def _log(self, curves: TrainingLog, sums: dict[str, list[float]], rate: float) -> None:
         means = {
