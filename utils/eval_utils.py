@@ -81,8 +81,9 @@ def track(
                 bar.set_postfix(keyframes=tracker.n, refresh=False)
                 if interrupt.is_set():
                     break
-        except KeyboardInterrupt:  # from the stream itself: between two frames, so the tracker is whole
-            if not keep_on_interrupt:
+        except KeyboardInterrupt:
+            # the first can only come from the stream, between two frames; a second one may tear a frame
+            if not keep_on_interrupt or interrupt.is_set():
                 raise
             interrupt.set()
         if tracker is None:
