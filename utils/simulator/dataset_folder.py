@@ -13,13 +13,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import os
-import shutil
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +25,7 @@ import torch
 import yaml
 
 from devo.errors import InputError, OutputError
+from utils.atomic import atomic_folder
 from utils.events.writers import EventH5Writer
 from utils.simulator.scenes import UNBOUNDED
 from utils.simulator.sequence import SequenceSettings, SimulatedSequence
@@ -189,34 +186,3 @@ def _check_target(target: Path, overwrite: bool) -> None:
     if not (target / SCENE_FILE).is_file():
         raise InputError(f"{target} holds something else than a simulated recording (no {SCENE_FILE}), so it is not "
                          "overwritten; choose another --out")
-
-
-@contextlib.contextmanager
-def atomic_folder(target: Path) -> Iterator[Path]:
-    """Yield a temporary sibling folder that takes the place of `target` when the block ends without an error.
-
-    Raises:
-        OutputError: the folder cannot be created, filled or moved.
-    """
-    temporary: Path | None = None
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-        yield temporary
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o777 & ~mask)
-        if target.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
-            target.replace(old)
-            temporary.replace(target)
-            shutil.rmtree(old)
-        else:
-            temporary.replace(target)
-        temporary = None
-    except OSError as error:
-        raise OutputError(f"cannot write {target}: {error.strerror or error}; nothing was left half-written, "
-                          "check the folder's permissions and the free disk space") from error
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
