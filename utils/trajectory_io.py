@@ -118,7 +118,8 @@ def write_tum(path: str | os.PathLike[str], trajectory: Trajectory, *, comments:
     _write_lines(path, lines)
 
 
-def read_tum(path: str | os.PathLike[str], *, time_unit: str = "s") -> Trajectory:
+def read_tum(path: str | os.PathLike[str], *, time_unit: str = "s", skip_lines: int = 0,
+             skip_repeated: bool = False) -> Trajectory:
     """Read TUM text strictly: eight finite numbers a line, stamps increasing, unit quaternions.
 
     Stamps are parsed as decimals. They come back as int64 where all are whole microseconds up to the resolution
@@ -127,6 +128,8 @@ def read_tum(path: str | os.PathLike[str], *, time_unit: str = "s") -> Trajector
     Args:
         path: text; lines that begin with `#` and empty lines are skipped, a byte order mark is accepted.
         time_unit: unit of the first column: `s`, `ms`, `us` or `ns`.
+        skip_lines: lines at the head of the file that are skipped whatever they hold.
+        skip_repeated: use the first of several successive poses with the same stamp, instead of refusing them.
 
     Raises:
         InputError: unreadable file, unknown unit, or a line that is no pose; the message names file and line.
@@ -135,9 +138,14 @@ def read_tum(path: str | os.PathLike[str], *, time_unit: str = "s") -> Trajector
         raise InputError(f"time_unit must be one of {', '.join(_UNITS)}, found {time_unit!r}")
     stamps, poses = [], []
     for number, words in _data_lines(path):
+        if number <= skip_lines:
+            continue
         if len(words) != 8:
             _reject(path, f"line {number} has {len(words)} columns, expected 8: timestamp tx ty tz qx qy qz qw")
-        stamps.append(_parse_stamp(path, number, words[0], _UNITS[time_unit]))
+        stamp = _parse_stamp(path, number, words[0], _UNITS[time_unit])
+        if skip_repeated and stamps and stamp == stamps[-1]:
+            continue
+        stamps.append(stamp)
         poses.append(_parse_numbers(path, number, words[1:]))
     return _build(path, _stamp_array(stamps), np.array(poses).reshape(-1, 7))
 

@@ -25,15 +25,13 @@ class ImageList(NamedTuple):
     names: list[str] | None
 
 
-def read_image_list(path: Path, time_unit: TimeUnit | None = None) -> ImageList:
+def read_image_list(path: Path, time_unit: TimeUnit | None = None, *, whole: bool = True) -> ImageList:
     """Read lines `t`, `t name` or `id t name`; `#` starts a comment.
 
     Args:
         path: the file.
         time_unit: unit of t; None means microseconds for whole numbers and seconds for decimals.
-
-    Returns:
-        Stamps rounded to whole microseconds, like those of events, so that borders of windows fall equally.
+        whole: round stamps to whole microseconds, like those of events, so that borders of windows fall equally.
 
     Raises:
         InputError: the file is missing, empty, has other columns or numbers that are none.
@@ -50,7 +48,9 @@ def read_image_list(path: Path, time_unit: TimeUnit | None = None) -> ImageList:
     at = 1 if columns == 3 else 0
     stamps = [_decimal(path, number, words[at]) for number, words in rows]
     unit = time_unit or ("s" if any(re.search(r"[.eE]", words[at]) for _, words in rows) else "us")
-    scaled = [int((stamp * _MICROSECONDS_PER[unit]).to_integral_value(ROUND_HALF_UP)) for stamp in stamps]
+    scaled = [stamp * _MICROSECONDS_PER[unit] for stamp in stamps]
+    if whole:
+        scaled = [stamp.to_integral_value(ROUND_HALF_UP) for stamp in scaled]
     return ImageList(np.array(scaled, np.float64), None if columns == 1 else [words[-1] for _, words in rows])
 
 

@@ -18,7 +18,7 @@ from utils.datasets.options import SequenceOptions
 from utils.events.reader import EventReader
 from utils.events.slicing import EventWindow, WindowRule
 from utils.undistort import undistort_image
-from utils.voxel_grid import VoxelRectifier, remove_hot_pixels, to_voxel_grid
+from utils.voxel_grid import VoxelRectifier, remove_hot_pixels, resize_voxel, scale_intrinsics, to_voxel_grid
 
 Frame = tuple[torch.Tensor, torch.Tensor, float]
 GroundTruth = tuple[npt.NDArray[Any], npt.NDArray[np.float64]]
@@ -54,38 +54,43 @@ class Sequence:
         name: what to call the sequence.
         path: its folder or file.
         options: how it is read.
-        size: (width, height) of the sensor and of the voxel grids in pixels.
-        intrinsics: (4,) `fx fy cx cy` of the undistorted camera in pixels.
+        size: (width, height) of the sensor in pixels.
+        intrinsics: (4,) `fx fy cx cy` of the undistorted camera in pixels of the sensor.
         open_reader: opens the events; called anew for each pass.
         windows: the rule that cuts events into windows.
         rectify_map: (H, W, 2) forward map of `utils.undistort`, None for events that need no rectification.
         hot_pixel_stds: threshold of `remove_hot_pixels`, None for no filter.
-        images: image files, None where there are none.
+        images: image files, or one line that says why there are none.
+        voxel_size: (width, height) of the voxel grids, None for the size of the sensor; intrinsics are scaled along.
         read_ground_truth: returns stamps (N,) in microseconds and camera-to-world poses (N, 7); None without any.
         files: files in use by role, for reports.
 
     Attributes:
         height, width: of voxel grids in pixels.
-        intrinsics: (4,) float64, as above.
+        sensor_size: (width, height) of the sensor in pixels.
+        intrinsics: (4,) float64 `fx fy cx cy` of the voxel grids in pixels.
+        images: image files, None where there are none.
         expected_length: how many windows there are for a progress bar (empty ones included), None if unknown.
     """
 
     def __init__(self, name: str, path: Path, options: SequenceOptions, *, size: tuple[int, int],
                  intrinsics: npt.ArrayLike, open_reader: Callable[[], EventReader], windows: WindowRule,
                  rectify_map: npt.NDArray[np.float32] | None = None, hot_pixel_stds: float | None = None,
-                 images: ImageFiles | None = None, read_ground_truth: Callable[[], GroundTruth] | None = None,
-                 files: dict[str, Path] | None = None) -> None:
+                 images: ImageFiles | str | None = None, read_ground_truth: Callable[[], GroundTruth] | None = None,
+                 files: dict[str, Path] | None = None, voxel_size: tuple[int, int] | None = None) -> None:
         self.name = name
         self.path = path
         self.options = options
-        self.width, self.height = size
-        self.intrinsics = np.asarray(intrinsics, np.float64)
+        self.sensor_size = size
+        self.width, self.height = voxel_size or size
+        self.intrinsics = scale_intrinsics(intrinsics, size, (self.width, self.height))
         self._open_reader = open_reader
         self.windows = windows
         self._rectify_map = rectify_map
         self._rectifier: VoxelRectifier | None = None
         self._hot_pixel_stds = hot_pixel_stds
-        self.images = images
+        self.images = images if isinstance(images, ImageFiles) else None
+        self._no_images = images if isinstance(images, str) else "the recording has no images"
         self._read_ground_truth = read_ground_truth
         self._files = files or {}
         self._counts: dict[str, int] | None = None
@@ -129,7 +134,7 @@ class Sequence:
             InputError: the recording has no images, or one cannot be read.
         """
         if self.images is None:
-            raise InputError(f"{self.path}: the recording has no images")
+            raise InputError(f"{self.path}: {self._no_images}")
         images = self.images
         lower = -np.inf if self.options.start_us is None else self.options.start_us
         upper = np.inf if self.options.stop_us is None else self.options.stop_us
@@ -155,7 +160,8 @@ class Sequence:
             "name": self.name,
             "path": str(self.path),
             "files": {role: str(path) for role, path in self._files.items()},
-            "sensor_size": [self.width, self.height],
+            "sensor_size": list(self.sensor_size),
+            "voxel_size": [self.width, self.height],
             "intrinsics_fx_fy_cx_cy": [float(value) for value in self.intrinsics],
             "events_are_rectified": self._rectify_map is not None,
             "windows": {**self.windows.describe(), "every": self.options.stride, "start_us": self.options.start_us,
@@ -167,11 +173,13 @@ class Sequence:
     def _voxel(self, window: EventWindow) -> torch.Tensor:
         events = window.events
         if self._rectify_map is None:
-            voxel = to_voxel_grid(events.x, events.y, events.t_us, events.p, self.height, self.width)
+            width, height = self.sensor_size
+            voxel = to_voxel_grid(events.x, events.y, events.t_us, events.p, height, width)
         else:
             if self._rectifier is None:
                 self._rectifier = VoxelRectifier(self._rectify_map)
             voxel = self._rectifier(events)
+        voxel = resize_voxel(voxel, self.height, self.width)
         return voxel if self._hot_pixel_stds is None else remove_hot_pixels(voxel, self._hot_pixel_stds)
 
 
