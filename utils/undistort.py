@@ -103,27 +103,40 @@ def _check_inverse(calibration: Calibration, positions: npt.NDArray[Any], pixels
                          "the model")
 
 
-def undistort_image(image: npt.NDArray[np.uint8], calibration: Calibration,
-                    intrinsics: npt.ArrayLike) -> npt.NDArray[np.uint8]:
-    """Return the undistorted image, same size, black where the sensor saw nothing (bicubic).
+class ImageUndistorter:
+    """Undistort many images of one camera; size is kept, black where the sensor saw nothing.
 
     Args:
-        image: (H, W) or (H, W, 3) uint8 of the distorted camera.
         calibration: the camera.
         intrinsics: (4,) `fx fy cx cy` of the undistorted image, as `rectify_map` returns them.
-
-    Raises:
-        InputError: the image has another size than the calibration.
+        interpolation: OpenCV's flag; bicubic unless a data set was made with another.
     """
-    if image.shape[:2] != (calibration.height, calibration.width):
-        raise InputError(f"image of {image.shape[1]}x{image.shape[0]} pixels, but the calibration is for "
-                         f"{calibration.width}x{calibration.height}")
-    K, D, size = calibration.camera_matrix, np.array(calibration.coefficients), (calibration.width, calibration.height)
-    P = _matrix(np.asarray(intrinsics, np.float64))
-    is_fisheye = calibration.distortion_model == "fisheye"
-    build = cv2.fisheye.initUndistortRectifyMap if is_fisheye else cv2.initUndistortRectifyMap
-    map_x, map_y = build(K, D, np.eye(3), P, size, cv2.CV_32FC1)
-    return cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC)  # type: ignore[return-value]
+
+    def __init__(self, calibration: Calibration, intrinsics: npt.ArrayLike,
+                 interpolation: int = cv2.INTER_CUBIC) -> None:
+        self._size = size = (calibration.width, calibration.height)
+        self._interpolation = interpolation
+        is_fisheye = calibration.distortion_model == "fisheye"
+        build = cv2.fisheye.initUndistortRectifyMap if is_fisheye else cv2.initUndistortRectifyMap
+        self._map_x, self._map_y = build(calibration.camera_matrix, np.array(calibration.coefficients), np.eye(3),
+                                         _matrix(np.asarray(intrinsics, np.float64)), size, cv2.CV_32FC1)
+
+    def __call__(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """Return the undistorted (H, W) or (H, W, 3) uint8 image.
+
+        Raises:
+            InputError: the image has another size than the calibration.
+        """
+        if image.shape[1::-1] != self._size:
+            raise InputError(f"image of {image.shape[1]}x{image.shape[0]} pixels, but the calibration is for "
+                             f"{self._size[0]}x{self._size[1]}")
+        return cv2.remap(image, self._map_x, self._map_y, self._interpolation)  # type: ignore[return-value]
+
+
+def undistort_image(image: npt.NDArray[np.uint8], calibration: Calibration,
+                    intrinsics: npt.ArrayLike) -> npt.NDArray[np.uint8]:
+    """Return one undistorted image, see `ImageUndistorter`."""
+    return ImageUndistorter(calibration, intrinsics)(image)
 
 
 def write_rectify_map(path: str | os.PathLike[str], positions: npt.ArrayLike) -> None:
