@@ -16,6 +16,11 @@ from utils.events.validate import TimeUnit
 _MICROSECONDS_PER: dict[str, Decimal] = {"s": Decimal(10**6), "ms": Decimal(10**3), "us": Decimal(1),
                                          "ns": Decimal("0.001")}
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
+EVENT_SUFFIXES = (".h5", ".hdf5", ".raw", ".bag", ".mcap", ".db3", ".aedat4", ".txt", ".csv", ".npz", ".npy")
+CALIBRATION_NAMES = ("calib.yaml", "calib.yml", "calib.json", "calib.txt")
+STAMP_NAMES = ("images_timestamps_us.txt", "image_timestamps.txt", "images.txt")
+NOT_EVENT_NAMES = frozenset((*CALIBRATION_NAMES, *STAMP_NAMES, "groundtruth.txt"))
+"""Text files of a recording of one's own that hold no events, whatever their ending."""
 
 
 class ImageList(NamedTuple):

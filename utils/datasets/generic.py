@@ -9,7 +9,15 @@ import numpy.typing as npt
 
 from devo.errors import InputError
 from utils.calibration import Calibration, read_calibration
-from utils.datasets.files import ImageList, natural_order, read_image_list
+from utils.datasets.files import (
+    CALIBRATION_NAMES,
+    EVENT_SUFFIXES,
+    NOT_EVENT_NAMES,
+    STAMP_NAMES,
+    ImageList,
+    natural_order,
+    read_image_list,
+)
 from utils.datasets.registry import SequenceOptions, register
 from utils.datasets.sequence import GroundTruth, ImageFiles, Sequence
 from utils.events.reader import EventReader, open_events
@@ -17,9 +25,6 @@ from utils.events.slicing import CountWindows, StampWindows, TimeWindows, Window
 from utils.trajectory_io import read_tum
 from utils.undistort import rectify_map
 
-EVENT_SUFFIXES = (".h5", ".hdf5", ".txt", ".csv", ".npz", ".npy")
-CALIBRATION_NAMES = ("calib.yaml", "calib.yml", "calib.json", "calib.txt")
-STAMP_NAMES = ("images_timestamps_us.txt", "image_timestamps.txt", "images.txt")
 DEFAULT_WINDOW_US = 33_333
 _LEAST_LAST_FRACTION = 0.5
 
@@ -28,10 +33,10 @@ _LEAST_LAST_FRACTION = 0.5
 def open_generic(path: Path, options: SequenceOptions) -> Sequence:
     """Open a recording that follows no data set's own layout.
 
-    A folder holds an event file (`events.{h5,hdf5,txt,csv,npz,npy}`, or the only file that `open_events`
-    accepts) and usually `calib.{yaml,json,txt}`; optional are `groundtruth.txt` (TUM, seconds, camera to world), image
-    stamps (`images_timestamps_us.txt`, `image_timestamps.txt` or `images.txt`) and `images/`. If `path` is the
-    event file itself, only a calibration beside it is used.
+    A folder holds an event file (`events.{h5,hdf5,raw,bag,mcap,db3,aedat4,txt,csv,npz,npy}`, or the only file that
+    `open_events` accepts) and usually `calib.{yaml,json,txt}`; optional are `groundtruth.txt` (TUM, seconds, camera to
+    world), image stamps (`images_timestamps_us.txt`, `image_timestamps.txt` or `images.txt`) and `images/`. If `path`
+    is the event file itself, only a calibration beside it is used.
 
     Windows: `window_ms` or `window_events` of the options; else from image stamp to image stamp (or `window_dt_ms`
     long), if there are stamps; else 33.333 ms. The last window is dropped if less than half of it is covered.
@@ -88,7 +93,7 @@ def find_event_file(folder: Path, options: SequenceOptions) -> Path:
                          "one to use as path together with --calib")
     if not candidates:
         tried = f"; tried: {' | '.join(reasons[:3])}" if reasons else ""
-        raise InputError(f"{folder}: no event file, expected events.h5, .hdf5, .txt, .csv, .npz or .npy{tried}")
+        raise InputError(f"{folder}: no event file, expected events{', '.join(EVENT_SUFFIXES)}{tried}")
     return candidates[0]
 
 
@@ -96,7 +101,7 @@ def _files_with_events(folder: Path, options: SequenceOptions) -> tuple[list[Pat
     """Return the files that can be opened as events, and why others cannot."""
     accepted, reasons = [], []
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in EVENT_SUFFIXES or not file.is_file():
+        if file.suffix.lower() not in EVENT_SUFFIXES or file.name in NOT_EVENT_NAMES or not file.is_file():
             continue
         try:
             open_events(file, time_unit=options.time_unit, on_unsorted=options.on_unsorted).close()

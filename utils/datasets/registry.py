@@ -9,9 +9,10 @@ from pathlib import Path
 
 from devo.errors import InputError
 from utils.datasets.options import SequenceOptions
+from utils.datasets.recognise import AUTO, AmbiguousError, Recognised, recognise
 from utils.datasets.sequence import Sequence
 
-__all__ = ["DATASETS", "DatasetSpec", "Sequence", "SequenceOptions", "open_sequence", "register"]
+__all__ = ["DATASETS", "DatasetSpec", "Sequence", "SequenceOptions", "locate_sequence", "open_sequence", "register"]
 
 Opener = Callable[[Path, SequenceOptions], Sequence]
 
@@ -50,21 +51,51 @@ def register(name: str, summary: str) -> Callable[[Opener], Opener]:
     return enter
 
 
+def locate_sequence(name: str, path: str | os.PathLike[str], options: SequenceOptions | None = None) -> Recognised:
+    """Find the sequence that a data set and a path mean, without opening it.
+
+    Args:
+        name: data set, a key of `DATASETS`, or "auto" to recognise it by its files.
+        path: folder of the sequence or one around it, ROS bag, or event file.
+        options: as for `open_sequence`; the side and whether a calibration is given matter here.
+
+    Raises:
+        InputError: unknown data set, missing path, or nothing fits (see `recognise`).
+    """
+    options = options if options is not None else SequenceOptions()
+    if name != AUTO and name not in DATASETS:
+        raise InputError(f"unknown data set {name!r}, known are: {AUTO}, {', '.join(sorted(DATASETS))}")
+    calibrated = options.calib is not None or options.intrinsics is not None
+    return recognise(path, options.side, name, calibrated)
+
+
 def open_sequence(name: str, path: str | os.PathLike[str], options: SequenceOptions | None = None) -> Sequence:
     """Open one sequence of a data set.
 
     Args:
-        name: data set, a key of `DATASETS`; "generic" reads recordings of your own.
-        path: folder (or, for generic, event file) of the sequence.
+        name: data set, a key of `DATASETS`; "generic" reads recordings of your own; "auto" recognises the data set by
+            its files (`locate_sequence` says what it found).
+        path: folder (or, for generic, event file) of the sequence; the folder around it will do, too.
         options: how to read it; None means the defaults.
 
     Raises:
-        InputError: unknown data set, missing path, or a recording that cannot be used.
+        InputError: unknown data set, missing path, or a recording that cannot be used. For a raw sequence the message
+            says which command preprocesses it.
     """
+    options = options if options is not None else SequenceOptions()
+    if name == AUTO:
+        found = locate_sequence(name, path, options).require_ready()
+        return DATASETS[found.dataset].open(found.path, options)
     spec = DATASETS.get(name)
     if spec is None:
-        raise InputError(f"unknown data set {name!r}, known are: {', '.join(sorted(DATASETS))}")
+        raise InputError(f"unknown data set {name!r}, known are: {AUTO}, {', '.join(sorted(DATASETS))}")
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path} does not exist, expected a sequence of data set {name!r}")
-    return spec.open(path, options if options is not None else SequenceOptions())
+    try:
+        found = locate_sequence(name, path, options)
+    except AmbiguousError:
+        raise
+    except InputError:  # the reader knows better what it is missing
+        return spec.open(path, options)
+    return spec.open(found.path if found.ready else path, options)
