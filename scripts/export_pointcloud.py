@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Track a recording and write trajectory, sparse point cloud, depths and a preview picture.
 
-Example: python scripts/export_pointcloud.py --dataset generic --datapath my_recording --out results/cloud.npy
+Example: python scripts/export_pointcloud.py --datapath my_recording --out results/cloud.npy
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def build_arg_parser(datapath_required: bool = True) -> argparse.ArgumentParser:
     parser = AliasParser(prog="export_pointcloud.py", description=__doc__)
     add = parser.add_argument
     add("--datapath", required=datapath_required, help="sequence folder, or an event file for --dataset generic")
-    add("--dataset", default="fpv", help="how to read it: generic, fpv, rpg, vector, ...")
+    add("--dataset", default="auto", help="how to read it: generic, fpv, rpg, vector, ...; auto looks at its files")
     add("--out", default="point_cloud.npy", help="base name of all outputs; .npy, .ply, .npz or .pcd")
     add("--weights", help="checkpoint, name of built-in weights, or random:SEED (default: the built-in ones)")
     add("--config", help="settings as YAML (default: preset of the dataset)")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from devo.kernels import active_kernels
 from devo.result import TrackingResult
 from utils.clouds.cloud import PointCloud
 from utils.clouds.filters import FilterReport
-from utils.datasets.registry import Sequence, SequenceOptions, open_sequence
+from utils.datasets.recognise import AUTO
+from utils.datasets.registry import Sequence, SequenceOptions, locate_sequence, open_sequence
 from utils.eval_utils import track
 from utils.export_products import (
     CONVENTIONS,
@@ -45,7 +46,7 @@ class ExportOptions:
     """What `scripts/export_pointcloud.py` was asked for; the field names are those of its flags."""
 
     datapath: str
-    dataset: str = "fpv"
+    dataset: str = "auto"
     config: str | None = None
     opts: list[str] | None = None
     weights: str | None = None
@@ -145,6 +146,7 @@ def export_pointcloud(options: ExportOptions) -> dict[str, Any]:
     """
     started = time.perf_counter()
     products = Products.of(options.out)
+    options = _recognised(options)
     device = resolve_device(options.device)
     weights = find_weights(options.weights)
     config = find_config(options.config, options.dataset, weights)
@@ -170,6 +172,15 @@ def export_pointcloud(options: ExportOptions) -> dict[str, Any]:
     save_json(products.path("_meta.json"), meta)
     _report(result, cloud, reports, products)
     return meta
+
+
+def _recognised(options: ExportOptions) -> ExportOptions:
+    """Replace the data set "auto" and its path by what the files say, and tell why."""
+    if options.dataset != AUTO:
+        return options
+    found = locate_sequence(AUTO, options.datapath, options.sequence_options()).require_ready()
+    say(f"recognised: {found}")
+    return replace(options, dataset=found.dataset, datapath=str(found.path))
 
 
 def _track(sequence: Sequence, cfg: Config, network: torch.nn.Module, device: torch.device, options: ExportOptions,
