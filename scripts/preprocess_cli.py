@@ -19,10 +19,15 @@ def build_arg_parser(dataset: str, description: str | None, sides: tuple[str, ..
     add("--overwrite", action="store_true", help="make all products anew; complete ones are kept otherwise")
     add("--images", action=argparse.BooleanOptionalAction, default=True,
         help="undistort the intensity images too (only odometry on images needs them)")
-    add("--on_unsorted", choices=("error", "sort"), default="error",
-        help="what to do about events that run backwards in time; sort needs memory for all events")
+    parser.set_defaults(on_unsorted="error")
     add("--quiet", action="store_true", help="no progress bar and no list of what was made")
     return parser
+
+
+def add_on_unsorted(parser: AliasParser) -> None:
+    """Add the option of data sets whose events are read from bags."""
+    parser.add_argument("--on_unsorted", choices=("error", "sort"), default="error",
+                        help="what to do about events that run backwards in time; sort needs memory for all events")
 
 
 def preprocess_main(dataset: str, argv: Sequence[str] | None = None, *, description: str | None = None,

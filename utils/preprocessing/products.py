@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from devo.errors import InputError, OutputError
 from utils.atomic import atomic_folder, atomic_path
-from utils.calibration import Calibration
+from utils.calibration import Calibration, read_calibration
 from utils.preprocessing.registry import PreprocessOptions
 from utils.undistort import rectify_map, undistorted_intrinsics, write_rectify_map
 
@@ -77,7 +77,7 @@ class Products:
         differently (see `undistorted_intrinsics`).
         """
         if not self.missing(path):
-            return read_pinhole(path)
+            return read_calibration(path, image_size=(calibration.width, calibration.height)).intrinsics
         intrinsics = undistorted_intrinsics(calibration, balance=balance)
         self.text(path, pinhole_text(intrinsics))
         return intrinsics
@@ -115,24 +115,6 @@ class Products:
 def pinhole_text(intrinsics: npt.ArrayLike) -> str:
     """Return the line `fx fy cx cy`."""
     return " ".join(repr(value) for value in np.asarray(intrinsics, np.float64).tolist())
-
-
-def read_pinhole(path: Path) -> Floats:
-    """Return `fx fy cx cy` (4,) float64 from a pinhole text.
-
-    Raises:
-        InputError: the file is missing or holds something else.
-    """
-    try:
-        words = path.read_text("ascii").split()
-        values = np.array([float(word) for word in words])
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    except (UnicodeDecodeError, ValueError):
-        raise InputError(f"{path}: expected one line `fx fy cx cy`") from None
-    if values.shape != (4,) or not np.isfinite(values).all() or values[:2].min() <= 0:
-        raise InputError(f"{path}: {' '.join(words)[:80] or 'empty'}, expected `fx fy cx cy` in pixels")
-    return values
 
 
 def read_raw_image(path: Path) -> Image:

@@ -98,6 +98,10 @@ def _walk(folder: Path, is_sequence: Callable[[Path], bool], seen: set[str]) -> 
     if is_sequence(folder):
         yield folder
         return
-    for entry in sorted(folder.iterdir()):
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"cannot search {folder} for recordings: {error.strerror or error}") from error
+    for entry in entries:
         if entry.is_dir() and not entry.name.startswith("."):
             yield from _walk(entry, is_sequence, seen)
