@@ -36,6 +36,7 @@ FILES = {
     "mvsec": (["seq_data/seq_data.hdf5", "seq_data/tss_imgs_us_left.txt", "seq_data/calib_undist_left.txt",
                "seq_data/rectify_map_left.h5"],
               ["seq_data.hdf5", "indoor_flying_calib/camchain-imucam-indoor_flying.yaml"]),
+    "tartan": (["seq/h5/0000000001.h5"], []),
     "generic": (["seq/events.h5", "seq/calib.yaml"], []),
 }
 TOPICS = {"rpg": "/optitrack/davis_stereo", "hku": "/cpy_uav/viconros/odometry"}

@@ -31,7 +31,7 @@ class Layout:
     Attributes:
         dataset: name in the table of data sets.
         ready: what the reader needs.
-        raw: what preprocessing needs; with an `archive`, relative to the folder in which that lies.
+        raw: what preprocessing needs, nothing where there is none; with an `archive`, relative to its folder.
         archive: ending of a raw file of which preprocessing makes a folder of the same stem beside it; empty where
             preprocessing writes into the raw folder itself.
         topics: topics of which a ROS bag of this data set has at least one.
@@ -67,6 +67,7 @@ LAYOUTS = (
            ("events.h5", "images_timestamps.txt", "images/")),
     Layout("mvsec", ("*_data.hdf5", "tss_imgs_us_{side}.txt", "calib_undist_{side}.txt", "rectify_map_{side}.h5"),
            ("indoor_flying_calib/camchain-imucam-indoor_flying.yaml",), archive="_data.hdf5"),
+    Layout("tartan", ("h5/0*.h5",)),
 )
 """The data sets that can be told by their files; recordings of your own ("generic") are whatever else holds events."""
 
@@ -207,7 +208,7 @@ def _matches(folder: Path, side: str, layouts: Sequence[Layout], own: bool, cali
         elif layout.archive:
             matches += [match for file in _archives_of(folder, layout)
                         if (match := _of_archive(file, side, layout)) is not None]
-        elif folder.is_dir():
+        elif layout.raw and folder.is_dir():
             raw, absent = _look(folder, layout.raw, side)
             if not absent:
                 matches.append(Recognised(layout.dataset, folder, side, raw, missing, folder))
@@ -335,6 +336,8 @@ def _lacks(folder: Path, side: str, layout: Layout, found: tuple[str, ...], othe
     if layout.archive:
         origin = f"{folder.name}.{layout.archive.rpartition('.')[2]}"
         return f"{text}; `python scripts/pp_{layout.dataset}.py` makes it from {origin} beside the folder"
+    if not layout.raw:
+        return text
     absent = _list(_look(folder, layout.raw, side)[1])
     return f"{text}; `{preprocessing_command(layout.dataset, folder, side)}` makes it, once there is {absent}"
 
