@@ -136,7 +136,8 @@ def read_tum(path: str | os.PathLike[str], *, time_unit: str = "s", skip_lines: 
     """
     if time_unit not in _UNITS:
         raise InputError(f"time_unit must be one of {', '.join(_UNITS)}, found {time_unit!r}")
-    stamps, poses = [], []
+    stamps: list[Decimal] = []
+    poses = []
     for number, words in _data_lines(path):
         if number <= skip_lines:
             continue

@@ -2,8 +2,22 @@
 
 from __future__ import annotations
 
-from utils.datasets import generic
+from utils.datasets import eds, generic, mvsec, tartan, tumvie, vector
 from utils.datasets.registry import DATASETS, DatasetSpec, SequenceOptions, open_sequence, register
-from utils.datasets.sequence import Sequence
+from utils.datasets.sequence import Recording, Sequence
 
-__all__ = ["DATASETS", "DatasetSpec", "Sequence", "SequenceOptions", "generic", "open_sequence", "register"]
+__all__ = [
+    "DATASETS",
+    "DatasetSpec",
+    "Recording",
+    "Sequence",
+    "SequenceOptions",
+    "eds",
+    "generic",
+    "mvsec",
+    "open_sequence",
+    "register",
+    "tartan",
+    "tumvie",
+    "vector",
+]

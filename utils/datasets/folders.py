@@ -56,16 +56,26 @@ def voxel_iterator(voxeldir: str | os.PathLike[str], tss_file: str | os.PathLike
     paths, stamps = _files_and_stamps(Path(voxeldir), ext, tss_file, stride)
     camera = torch.tensor([float(value) * scale for value in intrinsics], dtype=torch.float64)
     for path, stamp_us in zip(paths, stamps):
-        with open_hdf5(path) as stream, hdf5_errors(path):
-            if "voxel" not in stream:
-                raise InputError(f"{path}: dataset voxel missing, found {', '.join(sorted(stream)) or 'nothing'}")
-            voxel = torch.from_numpy(np.asarray(stream["voxel"][()], np.float32))
-        if voxel.ndim != 3:
-            raise InputError(f"{path}: voxel grid has shape {tuple(voxel.shape)}, expected (bins, H, W)")
+        voxel = read_voxel(path)
         if scale != 1.0:
             voxel = F.interpolate(voxel[None], size=(int(voxel.shape[1] * scale), int(voxel.shape[2] * scale)),
                                   mode="bilinear", align_corners=False, antialias=False)[0]
         yield voxel, camera.clone(), float(stamp_us)
+
+
+def read_voxel(path: Path) -> torch.Tensor:
+    """Read the voxel grid (B, H, W) of one file as float32.
+
+    Raises:
+        InputError: the file is missing or damaged, or holds no voxel grid.
+    """
+    with open_hdf5(path) as stream, hdf5_errors(path):
+        if "voxel" not in stream:
+            raise InputError(f"{path}: dataset voxel missing, found {', '.join(sorted(stream)) or 'nothing'}")
+        voxel = torch.from_numpy(np.asarray(stream["voxel"][()], np.float32))
+    if voxel.ndim != 3:
+        raise InputError(f"{path}: voxel grid has shape {tuple(voxel.shape)}, expected (bins, H, W)")
+    return voxel
 
 
 def _files_and_stamps(folder: Path, ext: str, tss_file: str | os.PathLike[str] | None,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +15,7 @@ from devo.errors import InputError
 from utils.calibration import read_calibration
 from utils.datasets.files import natural_order, read_image_list
 from utils.datasets.options import SequenceOptions
-from utils.datasets.sequence import GroundTruth, ImageFiles
+from utils.datasets.sequence import GroundTruth, ImageFiles, Recording
 from utils.events.slicing import CountWindows, StampWindows, TimeWindows, WindowRule
 from utils.trajectory_io import read_tum
 
@@ -104,6 +106,35 @@ def read_pinhole(path: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
     return calibration.intrinsics
 
 
+def pinhole_of(fields: dict[str, Any]) -> npt.NDArray[np.float64]:
+    """Return `fx fy cx cy` (4,) of a JSON object with these keys.
+
+    Raises:
+        KeyError, TypeError, ValueError: it has other keys, or values that are no finite positive numbers.
+    """
+    numbers = np.array([float(fields[name]) for name in ("fx", "fy", "cx", "cy")])
+    if not np.isfinite(numbers).all() or numbers[:2].min() <= 0:
+        raise ValueError(f"fx fy cx cy are {numbers.tolist()}")
+    return numbers
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: the file is missing, damaged or holds something else.
+    """
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: not valid JSON ({' '.join(str(error).split())[:100]})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected a JSON object, found {type(content).__name__}")
+    return content
+
+
 def mean_interval_us(stamps_us: Stamps, path: Path) -> float:
     """Return the mean distance of stamps in microseconds.
 
@@ -152,19 +183,18 @@ def check_window_length(length_us: float, shortest_ms: float, longest_ms: float,
 
 
 def find_images(folder: Path, stamps_us: Stamps, read_intrinsics: Callable[[], npt.NDArray[np.float64]],
-                make_them: str, names: Sequence[str] | None = None) -> ImageFiles | str:
-    """Return the undistorted images, or why there are none; an event run needs none.
+                make_them: str) -> ImageFiles | str:
+    """Return the undistorted images of a folder in natural order, or why there are none; an event run needs none.
 
     Args:
         folder: where they are.
         stamps_us: (N,) stamps of all images.
         read_intrinsics: returns (4,) `fx fy cx cy` of the images.
         make_them: command that makes them.
-        names: (N,) file names; None means all images of the folder in natural order.
     """
     if not folder.is_dir():
         return f"there are no undistorted images in {folder.name}; make them with `{make_them}`"
-    paths = natural_order(folder) if names is None else [folder / name for name in names]
+    paths = natural_order(folder)
     if len(paths) != len(stamps_us):
         return (f"{folder.name} holds {len(paths)} images for {len(stamps_us)} stamps; complete them with "
                 f"`{make_them}`")
@@ -181,3 +211,14 @@ def poses_reader(path: Path, *, time_unit: str = "us", skip_lines: int = 0) -> C
         return trajectory.t_us, trajectory.world_T_cam
 
     return read
+
+
+def require_size(sequence: Recording, H: int, W: int) -> None:
+    """Check that voxel grids were asked for in the size of the sensor.
+
+    Raises:
+        InputError: H or W differ.
+    """
+    if (sequence.width, sequence.height) != (W, H):
+        raise InputError(f"H={H}, W={W} were given, but {sequence.path} is of a sensor with H={sequence.height}, "
+                         f"W={sequence.width}")

@@ -6,15 +6,18 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from devo.errors import InputError
 from utils.datasets.options import SequenceOptions
 from utils.datasets.recognise import AUTO, AmbiguousError, Recognised, recognise
-from utils.datasets.sequence import Sequence
+from utils.datasets.sequence import Recording, Sequence
 
-__all__ = ["DATASETS", "DatasetSpec", "Sequence", "SequenceOptions", "locate_sequence", "open_sequence", "register"]
+__all__ = ["DATASETS", "DatasetSpec", "Recording", "Sequence", "SequenceOptions", "locate_sequence", "open_sequence",
+           "register"]
 
-Opener = Callable[[Path, SequenceOptions], Sequence]
+Opener = Callable[[Path, SequenceOptions], Recording]
+OpenerT = TypeVar("OpenerT", bound=Opener)
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,13 @@ DATASETS: dict[str, DatasetSpec] = {}
 """All known data sets by name; filled while the package `utils.datasets` is imported, constant from then on."""
 
 
-def register(name: str, summary: str) -> Callable[[Opener], Opener]:
-    """Enter a class or function `(path, options) -> Sequence` in the table of data sets.
+def register(name: str, summary: str) -> Callable[[OpenerT], OpenerT]:
+    """Enter a class or function `(path, options) -> Recording` in the table of data sets.
 
     Raises:
         InputError: the name is taken.
     """
-    def enter(opener: Opener) -> Opener:
+    def enter(opener: OpenerT) -> OpenerT:
         if name in DATASETS:
             raise InputError(f"data set {name!r} is registered twice")
         DATASETS[name] = DatasetSpec(name, summary, opener)
@@ -69,7 +72,7 @@ def locate_sequence(name: str, path: str | os.PathLike[str], options: SequenceOp
     return recognise(path, options.side, name, calibrated)
 
 
-def open_sequence(name: str, path: str | os.PathLike[str], options: SequenceOptions | None = None) -> Sequence:
+def open_sequence(name: str, path: str | os.PathLike[str], options: SequenceOptions | None = None) -> Recording:
     """Open one sequence of a data set.
 
     Args:

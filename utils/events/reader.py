@@ -177,6 +177,25 @@ class RowReader(EventReader):
         ends = [self._columns(row, row + 1)[2] for row in (0, self.rows - 1)]
         return int(ends[0][0]), int(ends[1][0])
 
+    def read_rows(self, first: int, last: int) -> Events:
+        """Return the events numbered `first` to `last - 1`, counted from 0.
+
+        Successive calls with growing numbers decode each part of the file once.
+
+        Raises:
+            InputError: numbers outside the recording, or the file turns out to be damaged.
+        """
+        if not 0 <= first <= last <= self.rows:
+            raise InputError(f"{self.path}: cannot read events {first} to {last} of {self.rows}")
+        parts = []
+        while first < last:
+            number, offset = divmod(first, self.rows_per_block)
+            block = self._block(number)
+            assert block is not None
+            parts.append(block[offset:offset + last - first])
+            first += len(parts[-1])
+        return Events.concatenate(parts)
+
     def _decode(self, block: int) -> Events | None:
         first = block * self.rows_per_block
         if first >= self.rows:

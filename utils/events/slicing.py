@@ -259,6 +259,74 @@ class StampWindows(WindowRule):
         return starts[keep].tolist(), stops[keep].tolist()
 
 
+@dataclass(frozen=True, eq=False)
+class RowWindows(WindowRule):
+    """Windows between given event numbers: window i holds the events `[e_{i-1}, e_i)`, with `e_{-1} = 0`.
+
+    Args:
+        rows: (N,) whole event numbers `e_i`; negative ones count as 0.
+        stamps_us: (N,) increasing, microseconds; window i ends at stamp i and begins at the one before it (the first
+            one at the first event, if that is earlier).
+
+    Raises:
+        InputError: numbers or stamps that run backwards, or lists of different length.
+    """
+
+    rows: npt.NDArray[np.int64]
+    stamps_us: npt.NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        rows, stamps = np.maximum(np.asarray(self.rows), 0), np.asarray(self.stamps_us, np.float64)
+        if rows.ndim != 1 or rows.shape != stamps.shape or not len(rows) or rows.dtype.kind not in "iu":
+            raise InputError(f"event numbers are {rows.dtype} {rows.shape} for stamps {stamps.shape}, expected as many "
+                             "whole numbers as stamps, at least 1")
+        for what, values in (("event number", rows), ("stamp", stamps)):
+            wrong = np.flatnonzero(~(values[1:] >= values[:-1]))
+            if len(wrong):
+                raise InputError(f"{what} {wrong[0] + 1} is {values[wrong[0] + 1]} and smaller than the one before it")
+        object.__setattr__(self, "rows", rows.astype(np.int64))
+        object.__setattr__(self, "stamps_us", stamps)
+
+    def over(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+             every: int = 1) -> Iterator[EventWindow]:
+        """Yield the windows of a reader whose events can be addressed by number.
+
+        Raises:
+            InputError: the recording has fewer events than the numbers say.
+        """
+        if not isinstance(reader, RowReader):
+            raise InputError(f"{reader.path}: {reader.format_name} files have no event numbers; convert the recording")
+        if self.rows[-1] > len(reader):
+            raise InputError(f"{reader.path}: {len(reader)} events, but windows go up to event {self.rows[-1]}; the "
+                             "file is damaged or belongs to another recording")
+        starts_us = self._starts_us(reader)
+        for i in self._chosen(reader, start_us, stop_us, every).tolist():
+            first = int(self.rows[i - 1]) if i else 0
+            yield EventWindow(reader.read_rows(first, int(self.rows[i])), float(starts_us[i]), float(self.stamps_us[i]))
+
+    def count(self, reader: EventReader, start_us: float | None = None, stop_us: float | None = None,
+              every: int = 1) -> int:
+        """Return the number of windows, from the stamps alone."""
+        return len(self._chosen(reader, start_us, stop_us, every))
+
+    def describe(self) -> dict[str, object]:
+        """Return the rule as plain values."""
+        return {"rule": "event numbers", "stamps": len(self.stamps_us)}
+
+    def _starts_us(self, reader: EventReader) -> npt.NDArray[np.float64]:
+        first = min(float(reader.time_range_us()[0]), float(self.stamps_us[0]))
+        return np.concatenate([[first], self.stamps_us[:-1]])
+
+    def _chosen(self, reader: EventReader, start_us: float | None, stop_us: float | None,
+                every: int) -> npt.NDArray[np.intp]:
+        wanted = np.ones(len(self.rows), bool)
+        if start_us is not None:
+            wanted &= self._starts_us(reader) >= start_us
+        if stop_us is not None:
+            wanted &= self.stamps_us <= stop_us
+        return np.flatnonzero(wanted)[::every]
+
+
 class EventSlicer:
     """Random access to the events of an HDF5 file by time, with the interface that users of DSEC know.
 
