@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from devo.errors import InputError
 from utils.datasets.prefetch import prefetch
 
-
 ROOT = Path(__file__).resolve().parents[2]
 
 
