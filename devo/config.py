@@ -46,6 +46,9 @@ DEFAULTS: dict[str, Any] = {
     # inverse depth of new patches before initialisation; 0 = random in (0,1) as published, which on scenes with little
     # relief often ends in the mirrored solution (scene and motion inverted)
     "INITIAL_INV_DEPTH": 0.5,
+    # poses of frames that were passed over before initialisation because the camera had hardly moved: interpolate (in
+    # time, between the keyframes around them) or hold (that of the keyframe before, as published)
+    "STILL_FRAMES": "interpolate",
     # keep the principal point when columns are cropped, as the published 346-px results did
     "LEGACY_PRINCIPAL_POINT": False,
     # accepted for old frame-network files, has no effect
@@ -57,6 +60,7 @@ _AT_LEAST = {
     "KEYFRAME_INDEX": 2, "KEYFRAME_THRESH": 0.0, "MOTION_DAMPING": 0.0, "RING_SIZE": 0,
     "INITIAL_INV_DEPTH": 0.0,
 }
+_CHOICES = {"STILL_FRAMES": ("interpolate", "hold")}
 
 
 def _coerce(key: str, value: Any) -> Any:
@@ -77,6 +81,8 @@ def _coerce(key: str, value: Any) -> Any:
         usable = isinstance(value, str)
     if not usable:
         raise InputError(f"setting {key} is {value!r}; expected {type(default).__name__}, for example {default!r}")
+    if key in _CHOICES and value not in _CHOICES[key]:
+        raise InputError(f"setting {key} is {value!r}; expected one of {', '.join(_CHOICES[key])}")
     if key in _AT_LEAST and value < _AT_LEAST[key]:
         raise InputError(f"setting {key} is {value!r}; expected at least {_AT_LEAST[key]}")
     return value

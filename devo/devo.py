@@ -85,6 +85,7 @@ class DEVO(PatchGraph):
         self.counter = 0  # accepted frames, keyframe or not
         self.is_initialized = False
         self.tlist: list[float] = []
+        self.still_frames: list[int] = []  # passed over before initialisation
         self.viz_flow = viz_flow
         self.flow_data: dict[int, dict[str, Any]] = {}
         self.frames = FrameRecorder(self) if record_frame_observables else None
@@ -177,6 +178,7 @@ class DEVO(PatchGraph):
             threshold = PROBE_FLOW if scale == 1.0 else scale * scale
             if self.motion_probe() < threshold:
                 self.delta[self.counter - 1] = (self.counter - 2, _identity_pose(self.device))
+                self.still_frames.append(self.counter - 1)
                 self.counters["frames_without_motion"] += 1
                 return True
         self.n += 1

@@ -37,7 +37,32 @@ def camera_poses(tracker: DEVO) -> Tensor:
         parent = parent[parent]
     keyframe_pose = torch.full((count, 7), float("nan"), device=tracker.device)
     keyframe_pose[tracker.tstamps_[:tracker.n]] = tracker.poses_[:tracker.n]
-    return (SE3(relative) * SE3(keyframe_pose[parent])).data
+    poses = (SE3(relative) * SE3(keyframe_pose[parent])).data
+    if getattr(tracker.cfg, "STILL_FRAMES", "hold") == "interpolate":
+        poses = _between_neighbours(poses, tracker.still_frames, tracker.tlist)
+    return poses
+
+
+def _between_neighbours(cam_T_world: Tensor, still: list[int], t_us: list[float]) -> Tensor:
+    """Poses `(T,7)` with those of the frames in `still` interpolated in time between the nearest other frames.
+
+    The camera moves from a to b along the geodesic `exp(s log(T_b T_a^-1)) T_a`. Frames after the last other frame stay
+    as they are. The first frame is never still.
+    """
+    if not still:
+        return cam_T_world
+    moving = np.setdiff1d(np.arange(len(t_us)), still)
+    after = np.searchsorted(moving, still)
+    inside = after < len(moving)
+    frame, a, b = np.asarray(still)[inside], moving[after[inside] - 1], moving[after[inside]]
+    time = np.asarray(t_us)
+    span = time[b] - time[a]
+    share = np.divide(time[frame] - time[a], span, out=np.zeros(len(frame)), where=span > 0)
+    start, stop = SE3(cam_T_world[a].double()), SE3(cam_T_world[b].double())
+    tangent = (stop * start.inv()).log() * torch.from_numpy(share).to(cam_T_world.device)[:, None]
+    poses = cam_T_world.clone()
+    poses[frame] = (SE3.exp(tangent) * start).data.to(poses.dtype)
+    return poses
 
 
 def full_trajectory(tracker: DEVO) -> np.ndarray:

@@ -67,3 +67,9 @@ def test_missing_file_and_odd_lists(tmp_path: Path) -> None:
         Config().merge_from_file(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="pairs"):
         Config().merge_from_list(["NORM"])
+
+
+def test_settings_with_choices() -> None:
+    assert Config({"STILL_FRAMES": "hold"}).STILL_FRAMES == "hold"
+    with pytest.raises(InputError, match="interpolate, hold"):
+        Config({"STILL_FRAMES": "guess"})
