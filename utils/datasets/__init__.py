@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from utils.datasets import eds, generic, mvsec, tartan, tumvie, vector
+from utils.datasets import ecd, eds, fpv, generic, hku, mvsec, rpg, tartan, tumvie, vector
 from utils.datasets.registry import DATASETS, DatasetSpec, SequenceOptions, open_sequence, register
 from utils.datasets.sequence import Recording, Sequence
 
@@ -12,11 +12,15 @@ __all__ = [
     "Recording",
     "Sequence",
     "SequenceOptions",
+    "ecd",
     "eds",
+    "fpv",
     "generic",
+    "hku",
     "mvsec",
     "open_sequence",
     "register",
+    "rpg",
     "tartan",
     "tumvie",
     "vector",

@@ -6,12 +6,11 @@ from pathlib import Path
 
 from devo.errors import InputError
 from utils.calibration import Calibration, read_calibration
+from utils.datasets.ecd import SIZE
 from utils.datasets.files import read_image_list
 from utils.preprocessing.image_lists import listed_images, undistort_files
 from utils.preprocessing.products import Products
 from utils.preprocessing.registry import PreprocessOptions, Preprocessor, register, walk_folders
-
-SIZE = (240, 180)
 
 
 def ecd_calibration(folder: Path) -> Calibration:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from devo.errors import InputError
 from utils.calibration import Calibration
 from utils.datasets.files import ImageList, read_image_list
+from utils.datasets.fpv import SIZE, read_offset_us
 from utils.events.reader import open_events
 from utils.preprocessing.image_lists import listed_images, undistort_files
 from utils.preprocessing.poses import inverse, rigid, times_transform
@@ -19,7 +20,6 @@ from utils.preprocessing.registry import PreprocessOptions, Preprocessor, regist
 from utils.sequence_names import find_in_path
 from utils.trajectory_io import Trajectory, read_tum
 
-SIZE = (346, 260)
 POSE_HEADER = "# #timestamp[us] px py pz qx qy qz qw"
 # Calibrations as published with the data set: lens (fx fy cx cy k1..k4, equidistant) and cam_T_imu (three rows).
 _LENSES = {
@@ -104,20 +104,6 @@ def _offset_us(products: Products, folder: Path, images: ImageList, poses: Traje
     offset_us = math.floor(min(first_us))
     products.text(file, f"{offset_us:.18e}\n")
     return offset_us
-
-
-def read_offset_us(file: Path) -> int:
-    """Return the offset of the clock in whole microseconds.
-
-    Raises:
-        InputError: the file is missing or holds no number.
-    """
-    try:
-        return int(float(file.read_text("ascii")))
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
-    except (ValueError, OverflowError):
-        raise InputError(f"{file}: expected one number, the offset of the clock in microseconds") from None
 
 
 def _write_poses(products: Products, folder: Path, poses: Trajectory, offset_us: int,

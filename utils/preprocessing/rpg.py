@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from utils.calibration import Calibration
+from utils.datasets.rpg import is_simulated
 from utils.preprocessing.bag_camera import BagCamera, Topics
 from utils.preprocessing.poses import inverse, rigid
 from utils.preprocessing.registry import PreprocessOptions, Preprocessor, register
 from utils.preprocessing.stereo_bag import BagRecipe, SideFiles, find_bags, run_bag
 
-SIMULATION = "simulation_3planes"
-"""The one recording that is simulated: 346x260 pixels, no distortion, poses of the camera itself."""
 CAMERAS = {
     "left": Calibration(
         240, 180, 196.63936292910697, 196.7329768429481, 105.06412666477927, 72.47170071387173, "radtan",
@@ -34,11 +33,6 @@ _RIGHT_T_LEFT = rigid((
     (-0.010059803423311134, 0.0010362522169301642, 0.9999488619606629, 0.0026798262366239016)))
 MARKER_T_CAM = {"left": _MARKER_T_LEFT, "right": _MARKER_T_LEFT @ inverse(_RIGHT_T_LEFT)}
 """From the camera to the body that the motion capture follows, by side."""
-
-
-def is_simulated(folder: Path) -> bool:
-    """Whether a recording is the simulated one, told by its path."""
-    return SIMULATION in str(folder.absolute())
 
 
 def run(folder: Path, options: PreprocessOptions) -> list[Path]:
