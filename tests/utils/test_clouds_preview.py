@@ -11,7 +11,9 @@ import pytest
 
 from devo.errors import InputError, OutputError
 from utils.clouds.cloud import PointCloud
-from utils.clouds.preview import _project, _rotations, _Scene, _view, save_preview
+from utils.clouds.preview import save_preview
+from utils.plots.draw import project, view_axes
+from utils.plots.scene import Scene, place_pyramids
 
 
 def _scene(outliers: int = 0) -> tuple[PointCloud, np.ndarray]:
@@ -54,7 +56,7 @@ def test_same_input_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("outliers", [1, 30, 500])
 def test_far_points_do_not_shrink_the_view(outliers: int) -> None:
-    clean, spoilt = (_Scene.build(*_scene(count), "depth") for count in (0, outliers))
+    clean, spoilt = (Scene.build(*_scene(count)) for count in (0, outliers))
     assert (spoilt.high - spoilt.low).max() < 3.0 * (clean.high - clean.low).max()  # the far points reach 1e4
     assert spoilt.outside >= outliers
 
@@ -77,12 +79,12 @@ def test_degenerate_clouds(tmp_path: Path, points: np.ndarray, poses: np.ndarray
 
 
 def test_the_perspective_is_no_mirror_image() -> None:
-    right, up, forward = _view()
-    np.testing.assert_allclose(_view() @ _view().T, np.eye(3), atol=1e-12)
+    right, up, forward = view_axes()
+    np.testing.assert_allclose(view_axes() @ view_axes().T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.cross(right, -up), forward, atol=1e-12)  # right x down = forward, as in the camera
-    scene = _Scene.build(*_scene(), "depth")
+    scene = Scene.build(*_scene())
     center = (scene.low + scene.high) / 2
-    image, distance = _project(center + np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), scene)
+    image, distance = project(center + np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), scene)
     assert image[1, 0] > image[0, 0]  # x goes right
     assert image[2, 1] < image[0, 1]  # y goes down
     assert distance[3] > distance[0]  # z goes away
@@ -90,8 +92,9 @@ def test_the_perspective_is_no_mirror_image() -> None:
 
 def test_frusta_use_camera_to_world() -> None:
     half = np.sqrt(0.5)
-    turned = _rotations(np.array([[0, half, 0, half]]))[0]  # a quarter turn about y: z of the camera becomes x
-    np.testing.assert_allclose(turned @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    quarter_turn_about_y = np.array([[5, 6, 7, 0, half, 0, half]])  # z of the camera becomes x of the world
+    placed = place_pyramids(quarter_turn_about_y, np.array([[0, 0, 0], [0, 0, 2.0]]))
+    np.testing.assert_allclose(placed, [[[5, 6, 7], [7, 6, 7]]], atol=1e-12)
 
 
 def test_wrong_arguments(tmp_path: Path) -> None:
