@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,13 +18,15 @@ import numpy as np
 from devo import __version__
 from devo.errors import InputError, OutputError
 from devo.observables import Observables
+from devo.poses import invert_poses_numpy
 from devo.result import TrackingResult
+from utils.array_files import save_array
 from utils.atomic import atomic_path
 from utils.clouds.cloud import PointCloud
 from utils.clouds.filters import FilterReport, clean_cloud
 from utils.clouds.io import SUFFIXES, write_cloud
 from utils.clouds.preview import save_preview
-from utils.map_recorder import save_array
+from utils.frame_bundle import FrameBundle
 from utils.trajectory_io import Trajectory, write_tum
 
 SCHEMA_VERSION = 1
@@ -53,10 +56,8 @@ class Products:
         Raises:
             InputError: an unknown suffix, or the folder cannot be written.
         """
-        path = Path(out)
-        if path.suffix and path.suffix.lower() not in SUFFIXES:
-            raise InputError(f"--out {path} ends in {path.suffix!r}; expected {', '.join(SUFFIXES)} or none")
-        products = cls(path.with_suffix(""), path.suffix.lower() or ".npy")
+        path = cloud_file(out, "--out")
+        products = cls(path.with_suffix(""), path.suffix.lower())
         try:
             with atomic_path(products.path("_meta.json")) as probe:
                 probe.write_text("{}")
@@ -75,6 +76,18 @@ class Products:
         self.written.append(save_array(self.path(ending), values))
 
 
+def cloud_file(name: str | PathLike[str], flag: str) -> Path:
+    """The file of a cloud as a flag names it; without a suffix it becomes `.npy`.
+
+    Raises:
+        InputError: a suffix that no writer knows.
+    """
+    path = Path(name)
+    if path.suffix and path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{flag} {path} ends in {path.suffix!r}; expected {', '.join(SUFFIXES)} or none")
+    return path if path.suffix else path.with_name(path.name + ".npy")
+
+
 class _WritableError(Exception):
     """Ends the probe write without leaving a file."""
 
@@ -85,39 +98,44 @@ def observables_to_cloud(observables: Observables, metadata: dict[str, str] | No
     return PointCloud(observables.points, colors, observables.scalars(), metadata or {})
 
 
-def frames_to_arrays(frame_data: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """The arrays of a frame bundle: poses are `cam_T_world`, `depths` are z-depths, centres NaN-padded per frame."""
-    counts = np.array([len(frame["depths"]) for frame in frame_data], dtype=np.int32)
-    width = int(counts.max()) if len(counts) else 0
-    centers = np.full((len(frame_data), width, 2), np.nan, dtype=np.float32)
-    for row, frame in zip(centers, frame_data, strict=True):
-        row[:len(frame["centers"])] = frame["centers"]
+def write_edge_cloud(products: Products, target: Path, cloud: PointCloud, outlier_step: tuple[str, Mapping[str, Any]]
+                     | None) -> list[FilterReport]:
+    """Write an edge cloud in the format of its suffix, as PLY with all per-point values, and cleaned.
 
-    def stacked(key: str, columns: int) -> np.ndarray:
-        return np.array([frame[key] for frame in frame_data], dtype=np.float32).reshape(-1, columns)
-
-    def joined(key: str, shape: tuple[int, ...]) -> np.ndarray:
-        parts = [np.zeros((0, *shape), np.float32), *(frame[key] for frame in frame_data)]
-        return np.concatenate(parts).astype(np.float32)
-
-    return {
-        "frame_ids": np.array([frame["frame_id"] for frame in frame_data], dtype=np.int64),
-        "timestamps": np.array([frame["timestamp"] for frame in frame_data], dtype=np.float64),
-        "poses": stacked("pose", 7), "intrinsics": stacked("intrinsics", 4), "counts": counts,
-        "offsets": (np.cumsum(counts) - counts).astype(np.int64), "points": joined("points", (3,)),
-        "depths": joined("depths", ()), "inv_depths": joined("inv_depths", ()), "centers": centers,
-        "pose_convention": np.array("T_cam_world"), "depths_convention": np.array("z-depth"),
-    }
+    Args:
+        target: file of the cloud; `<target without suffix>.ply` and `_cleaned.ply` go beside it.
+        outlier_step: the filter for the cleaned one; None for no cleaned cloud.
+    """
+    ply = target.with_suffix(".ply")
+    for path in dict.fromkeys((target, ply)):
+        write_cloud(path, cloud)
+        products.written.append(path)
+    if outlier_step is None:
+        return []
+    cleaned, reports = clean_cloud(cloud, [outlier_step])
+    products.written.append(target.with_name(f"{target.stem}_cleaned.ply"))
+    write_cloud(products.written[-1], cleaned)
+    return reports
 
 
-def save_frame_bundle(path: str | PathLike[str], frame_data: Sequence[dict[str, Any]]) -> Path:
-    """Write the frame bundle as `.npz` without pickles."""
-    target = Path(path)
-    if target.suffix != ".npz":
-        target = target.with_name(target.name + ".npz")
-    with atomic_path(target) as temporary:
-        np.savez(temporary, **frames_to_arrays(frame_data))  # type: ignore[arg-type]
-    return target
+FRAME_TABLE = ("frame_id", "t_us", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "keyframe", "points", "median_depth")
+
+
+def write_frame_table(path: Path, bundle: FrameBundle) -> None:
+    """Write one line of text per recorded frame: pose camera to world, whether it is a keyframe, its points.
+
+    The columns are those of `FRAME_TABLE`; times in microseconds, lengths in trajectory units.
+    """
+    poses = invert_poses_numpy(bundle.cam_T_world)
+    lines = [",".join(FRAME_TABLE)]
+    for i in range(len(bundle)):
+        inv_depths = bundle.inv_depths[bundle.rows(i)]
+        depth = 1.0 / float(np.median(inv_depths)) if len(inv_depths) else float("nan")
+        pose = ",".join(f"{value:.9g}" for value in poses[i])
+        lines.append(f"{bundle.frame_ids[i]},{bundle.t_us[i]:.3f},{pose},{int(bundle.keyframe[i])},{len(inv_depths)},"
+                     f"{depth:.6g}")
+    with atomic_path(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def save_json(path: Path, values: dict[str, Any]) -> Path:
@@ -140,8 +158,25 @@ def _jsonable(value: Any) -> Any:
 def run_environment() -> dict[str, Any]:
     """Versions and command line, so that a result explains itself."""
     versions = {package: importlib.metadata.version(package) for package in ("torch", "numpy", "open3d")}
-    return {"devo_version": __version__, "python": platform.python_version(), "machine": platform.machine(),
-            "versions": versions, "command": sys.argv}
+    return {"devo_version": __version__, "git_revision": git_revision(), "python": platform.python_version(),
+            "machine": platform.machine(), "versions": versions, "command": sys.argv}
+
+
+def git_revision() -> str | None:
+    """The commit of this checkout, with `+` where files differ from it; None outside of a repository."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / ".git").exists():
+        return None
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=10,
+                              check=True)
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None  # no git program, or a repository of somebody else
 
 
 def write_tracking(products: Products, result: TrackingResult) -> None:

@@ -2,99 +2,50 @@
 
 from __future__ import annotations
 
-import sys
+import contextlib
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from devo.checkpoint import builtin_weights, default_weights, load_network
 from devo.config import Config
 from devo.device import fast_dtype, resolve_device
+from devo.devo import DEVO
 from devo.errors import InputError, TrackingError
-from devo.kernels import active_kernels
 from devo.result import TrackingResult
+from utils.array_files import save_arrays
 from utils.clouds.cloud import PointCloud
-from utils.clouds.filters import FilterReport
+from utils.datasets.prefetch import LOOK_AHEAD, prefetch
 from utils.datasets.recognise import AUTO
-from utils.datasets.registry import Sequence, SequenceOptions, locate_sequence, open_sequence
-from utils.eval_utils import track
+from utils.datasets.registry import Recording, locate_sequence, open_sequence
+from utils.edge_clouds.edges import EdgeRecorder
+from utils.edge_clouds.run import collect_focus_cloud
+from utils.eval_utils import Frame, track
+from utils.export_meta import ExportRecord
+from utils.export_options import ExportOptions
 from utils.export_products import (
-    CONVENTIONS,
     Products,
     observables_to_cloud,
-    run_environment,
-    save_frame_bundle,
     save_json,
     write_cleaned,
+    write_edge_cloud,
+    write_frame_table,
     write_preview,
     write_tracking,
 )
+from utils.frame_bundle import FrameBundle, write_frame_bundle
 from utils.map_recorder import MapRecorder
+from utils.messages import say
 
-MAX_RELATIVE_SIGMA = 0.1  # cleaned clouds keep depths that are known to ten per cent
+__all__ = ["ExportOptions", "export_pointcloud", "find_config", "find_weights", "say"]
+
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULT_CONFIG = {"fpv": "eval_fpv.yaml", "rpg": "eval_rpg.yaml", "vector": "eval_vector.yaml"}
-
-
-@dataclass
-class ExportOptions:
-    """What `scripts/export_pointcloud.py` was asked for; the field names are those of its flags."""
-
-    datapath: str
-    dataset: str = "auto"
-    config: str | None = None
-    opts: list[str] | None = None
-    weights: str | None = None
-    out: str = "point_cloud.npy"
-    rgb: bool = False
-    stride: int = 1
-    side: str = "left"
-    start_us: float | None = None
-    stop_us: float | None = None
-    window_ms: float | None = None
-    window_events: int | None = None
-    calib: str | None = None
-    image_size: list[int] | None = None
-    intrinsics: list[float] | None = None
-    device: str = "auto"
-    seed: int = 0
-    viz: bool = False
-    viz_flow: bool = False
-    debug: bool = False
-    save_per_frame_cloud: bool = False
-    save_per_frame_cloud_path: str = "results/clouds"
-    voxel_size: float = 0.05
-    export_frame_data: bool = False
-    frame_data_out: str | None = None
-    frame_mode: str = "final"
-    save_dpviewer_cloud: bool = False
-    convert_ply: bool = False
-    cleanup: bool = True
-    cleanup_algo: str = "sor"
-    sor_nb_neighbors: int = 20
-    sor_std_ratio: float = 2.0
-    ror_radius: float | None = None
-    ror_min_neighbors: int | None = None
-
-    def sequence_options(self) -> SequenceOptions:
-        """The part that concerns the recording."""
-        return SequenceOptions(
-            side=self.side, stride=self.stride, start_us=self.start_us, stop_us=self.stop_us, window_ms=self.window_ms,
-            window_events=self.window_events, calib=Path(self.calib) if self.calib else None,
-            image_size=(self.image_size[0], self.image_size[1]) if self.image_size else None,
-            intrinsics=tuple(self.intrinsics) if self.intrinsics else None)
-
-    def cleanup_steps(self) -> list[str | tuple[str, dict[str, Any]]]:
-        """Quality first, then the chosen outlier filter."""
-        quality = ("quality", {"max_relative_sigma": MAX_RELATIVE_SIGMA})
-        if self.cleanup_algo == "ror":
-            return [quality, ("ror", {"radius": self.ror_radius, "min_neighbors": self.ror_min_neighbors})]
-        return [quality, ("sor", {"neighbors": self.sor_nb_neighbors, "std_ratio": self.sor_std_ratio})]
 
 
 def find_config(name: str | None, dataset: str, weights: str = "") -> Path:
@@ -145,6 +96,7 @@ def export_pointcloud(options: ExportOptions) -> dict[str, Any]:
         OutputError: a file could not be written.
     """
     started = time.perf_counter()
+    options.check()
     products = Products.of(options.out)
     options = _recognised(options)
     device = resolve_device(options.device)
@@ -157,20 +109,22 @@ def export_pointcloud(options: ExportOptions) -> dict[str, Any]:
     network = load_network(weights, patch_selector=selector, device=device)
     say(f"{sequence.name}: {sequence.width}x{sequence.height} px, weights {weights}, config {config.name}, "
         f"{device} ({str(fast_dtype(device, cfg.MIXED_PRECISION)).removeprefix('torch.')})")
-    result, recorder = _track(sequence, cfg, network, device, options, products)
-    products.written += recorder.written
-    cloud, reports = _write_clouds(products, result, options)
-    if options.export_frame_data and result.frame_data is not None:
-        target = options.frame_data_out or products.path("_frames.npz")
-        products.written.append(save_frame_bundle(target, result.frame_data))
+    recorders = _Recorders(options, products)
+    result = recorders.track(sequence, cfg, network, device)
+    record = ExportRecord(options, config, cfg, weights, sequence.describe(), sequence.width, sequence.height,
+                          sequence.intrinsics, result)
+    _write_clouds(products, record)
+    recorders.note(products, record)
+    bundle = _write_frames(products, record)
     if result.flowdata is not None:
         products.written.append(_save_flow(products, result.flowdata))
-    meta = _describe(options, config, cfg, weights, sequence, result, cloud, reports)
-    meta["runtime_s"] = round(time.perf_counter() - started, 3)
-    products.written.append(products.path("_meta.json"))
-    meta["files"] = [str(path) for path in products.written]
-    save_json(products.path("_meta.json"), meta)
-    _report(result, cloud, reports, products)
+    if bundle is not None and recorders.edges is not None:
+        _write_edges(products, record, "edge_cloud", recorders.edges.cloud(bundle))
+    if bundle is not None and options.export_focus_edge_cloud:
+        _write_meta(products, record, started)  # the next step reads the recording again and may be interrupted
+        _write_edges(products, record, "focus_edge_cloud", _focus_cloud(sequence, bundle, options, device))
+    meta = _write_meta(products, record, started)
+    _report(record, products)
     return meta
 
 
@@ -183,91 +137,130 @@ def _recognised(options: ExportOptions) -> ExportOptions:
     return replace(options, dataset=found.dataset, datapath=str(found.path))
 
 
-def _track(sequence: Sequence, cfg: Config, network: torch.nn.Module, device: torch.device, options: ExportOptions,
-           products: Products) -> tuple[TrackingResult, MapRecorder]:
-    dpviewer = products.path("_dpviewer.npy") if options.save_dpviewer_cloud else None
-    folder = Path(options.save_per_frame_cloud_path) if options.save_per_frame_cloud else None
-    recorder = MapRecorder(folder, options.voxel_size, dpviewer)
-    result = track(
-        sequence.frames() if options.rgb else sequence.voxels(), cfg, network, events=not options.rgb,
-        height=sequence.height, width=sequence.width, seed=options.seed, colors=True, viz=options.viz,
-        frame_mode=options.frame_mode if options.export_frame_data else None, accumulate_map=recorder.wants_map,
-        viz_flow=options.viz_flow, device=device, total=sequence.expected_length, progress=True, keep_on_interrupt=True,
-        on_frame=recorder.on_frame, on_end=recorder.on_end)
-    return result, recorder
+@contextlib.contextmanager
+def _stream(sequence: Recording, options: ExportOptions) -> Iterator[Iterable[Frame]]:
+    """The frames of the recording, made in advance by a thread that ends with the block."""
+    frames = sequence.frames() if options.rgb else sequence.voxels()
+    with contextlib.closing(prefetch(frames, LOOK_AHEAD if options.workers else 0)) as ahead:
+        yield ahead
 
 
-def _write_clouds(products: Products, result: TrackingResult, options: ExportOptions) -> tuple[
-        PointCloud | None, list[FilterReport]]:
+class _Recorders:
+    """What watches the tracker while it runs."""
+
+    def __init__(self, options: ExportOptions, products: Products) -> None:
+        self.options = options
+        folder = Path(options.save_per_frame_cloud_path) if options.save_per_frame_cloud else None
+        dpviewer = products.path("_dpviewer.npy") if options.save_dpviewer_cloud else None
+        self.map = MapRecorder(folder, options.voxel_size, dpviewer, keep=options.per_frame_keep)
+        self.edges = EdgeRecorder(options.edge_settings()) if options.export_edge_cloud else None
+
+    def track(self, sequence: Recording, cfg: Config, network: torch.nn.Module, device: torch.device) -> TrackingResult:
+        """Run the odometry."""
+        options = self.options
+        with _stream(sequence, options) as frames:
+            return track(
+                frames if self.edges is None else self.edges.tap(frames), cfg, network, events=not options.rgb,
+                height=sequence.height, width=sequence.width, seed=options.seed, colors=True, viz=options.viz,
+                frame_mode=options.frame_mode if options.wants_frames else None, accumulate_map=self.map.wants_map,
+                viz_flow=options.viz_flow, device=device, total=sequence.expected_length, progress=True,
+                keep_on_interrupt=True, on_frame=self._on_frame, on_end=self.map.on_end)
+
+    def _on_frame(self, tracker: DEVO) -> None:
+        self.map.on_frame(tracker)
+        if self.edges is not None:
+            self.edges.on_frame(tracker)
+        if self.options.debug:
+            explained = "not initialised" if not tracker.tracked else "explained" if tracker.tracked[-1] else "lost"
+            say(f"frame {tracker.counter - 1} at {tracker.tlist[-1]:.0f} us: {tracker.n} keyframes, {tracker.m} "
+                f"points, {len(tracker.kk)} edges, {explained}")
+
+    def note(self, products: Products, record: ExportRecord) -> None:
+        """Enter the files of the map into the record."""
+        products.written += self.map.written
+        record.frame_clouds = self.map.frame_clouds
+        if self.map.full_map_out is not None and Path(self.map.full_map_out) in self.map.written:
+            record.files["dpviewer_cloud"] = Path(self.map.full_map_out)
+
+
+def _write_clouds(products: Products, record: ExportRecord) -> None:
     """Raw arrays always; the cleaned cloud and the preview only where the structure means something."""
-    if not np.isfinite(result.poses).all() or len(result.poses) == 0:
+    result, options = record.result, record.options
+    if not record.tracked:
         result.observables = None  # random depths of a run that never started are no structure
     write_tracking(products, result)
     if result.observables is None:
-        return None, []
-    cloud = observables_to_cloud(result.observables)
-    reports: list[FilterReport] = []
+        return
+    raw = cloud = observables_to_cloud(result.observables)
     if options.cleanup:
-        cloud, reports = write_cleaned(products, cloud, options.cleanup_steps())
+        cloud, record.filters = write_cleaned(products, raw, options.cleanup_steps())
+        record.cleaned_points = len(cloud)
     shown, title = (cloud, products.base.name) if len(cloud) else (
-        observables_to_cloud(result.observables), f"{products.base.name} (raw: no point passed the cleaning)")
+        raw, f"{products.base.name} (raw: no point passed the cleaning)")
     write_preview(products, shown, result.poses, title)
-    return cloud, reports
+
+
+def _write_frames(products: Products, record: ExportRecord) -> FrameBundle | None:
+    """The structure per frame, on disk if it was asked for; None if nothing was recorded."""
+    result = record.result
+    if result.frame_data is None or result.observables is None:
+        return None
+    bundle = FrameBundle.from_frames(result.frame_data, np.unique(result.observables.host_frame))
+    if record.options.export_frame_data:
+        target = write_frame_bundle(record.options.frame_data_out or products.path("_frames.npz"), bundle)
+        table = target.with_suffix(".csv")
+        write_frame_table(table, bundle)
+        products.written += [target, table]
+        record.files["frame_data"] = target
+    return bundle
+
+
+def _focus_cloud(sequence: Recording, bundle: FrameBundle, options: ExportOptions, device: torch.device) -> PointCloud:
+    """The focus-refined edge cloud from a second pass over the recording; only a window of it is held."""
+    with _stream(sequence, options) as frames:
+        return collect_focus_cloud(frames, bundle, options.focus_settings(), device)
+
+
+def _write_edges(products: Products, record: ExportRecord, product: str, cloud: PointCloud) -> None:
+    """An edge cloud (`edge_cloud` or `focus_edge_cloud`) and its cleaned version."""
+    ending = product.removesuffix("_cloud") + "s"  # _edges, _focus_edges
+    target = record.options.edge_cloud_file(product) or products.path(f"_{ending}{products.suffix}")
+    step = record.options.outlier_step() if record.options.cleanup and len(cloud) else None
+    record.edge_filters[product] = write_edge_cloud(products, target, cloud, step)
+    record.files[product], record.edge_points[product] = target, len(cloud)
 
 
 def _save_flow(products: Products, flowdata: dict[int, dict[str, Any]]) -> Path:
     """`<base>_flow.npz`: per frame `{frame}_{ii,jj,kk,coords_est,n}`; arrays only, no pickle."""
-    from utils.atomic import atomic_path
-
     arrays = {f"{frame}_{key}": np.asarray(value) for frame, entry in flowdata.items()
               for key, value in entry.items() if key != "img"}
-    with atomic_path(products.path("_flow.npz")) as temporary:
-        np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
-    return products.path("_flow.npz")
+    return save_arrays(products.path("_flow.npz"), arrays, compressed=True)
 
 
-def _describe(options: ExportOptions, config: Path, cfg: Config, weights: str, sequence: Sequence,
-              result: TrackingResult, cloud: PointCloud | None, reports: list[FilterReport]) -> dict[str, Any]:
-    observables = result.observables
-    count = 0 if observables is None else len(observables)
-    tracked = len(result.poses) > 0 and bool(np.isfinite(result.poses).all())
-    return {
-        **CONVENTIONS, "dataset": options.dataset, "datapath": str(options.datapath), "side": options.side,
-        "config": str(config), "settings": cfg.as_dict(), "weights": weights, "edge_cloud_exported": False,
-        "edge_cloud_path": None, "focus_edge_cloud_exported": False, "focus_edge_cloud_path": None,
-        "start_us": options.start_us, "stop_us": options.stop_us, "H": sequence.height, "W": sequence.width,
-        "intrinsics_fx_fy_cx_cy": [float(value) for value in sequence.intrinsics],
-        "start_pose_xyz_quat_xyzw": result.poses[0].tolist() if tracked else None,
-        "start_timestamp_us": float(result.tstamps[0]) if len(result.tstamps) else None,
-        "num_poses": len(result.poses), "point_cloud_shape": [count, 3], "depths_shape": [count],
-        "flow_saved": result.flowdata is not None, "export_frame_data": options.export_frame_data,
-        "save_per_frame_cloud": options.save_per_frame_cloud, "seed": options.seed, "device": str(options.device),
-        "kernels": active_kernels(), "status": result.status.value, "message": result.message,
-        "tracked_share": round(result.tracked_share, 4), "n_keyframes": result.counters.get("keyframes", 0),
-        "n_skipped_voxels": result.counters.get("frames_too_empty", 0), "counters": result.counters,
-        "timings_s": {stage: round(seconds, 3) for stage, seconds in result.timings.items()},
-        "cleaned_points": None if cloud is None else len(cloud),
-        "filters": [{"name": r.name, "before": r.before, "after": r.after, "parameters": r.parameters,
-                     "removed": r.removed, "skipped": list(r.skipped)} for r in reports],
-        "sequence": sequence.describe(), **run_environment(),
-    }
+def _write_meta(products: Products, record: ExportRecord, started: float) -> dict[str, Any]:
+    meta = record.describe()
+    meta["runtime_s"] = round(time.perf_counter() - started, 3)
+    path = products.path("_meta.json")
+    meta["files"] = [str(written) for written in dict.fromkeys([*products.written, path])]
+    save_json(path, meta)
+    return meta
 
 
-def _report(result: TrackingResult, cloud: PointCloud | None, reports: list[FilterReport], products: Products) -> None:
+def _report(record: ExportRecord, products: Products) -> None:
     """Tell people what came out; an unusable run ends with an error that names what was kept."""
-    for report in reports:
+    result = record.result
+    for report in record.filters:
         say(str(report))
+    for product, count in record.edge_points.items():
+        say(f"{product.replace('_', ' ')}: {count} points")
     interrupted = bool(result.counters.get("interrupted"))
-    files = ", ".join(path.name for path in products.written)
+    files = ", ".join(path.name for path in [*products.written, products.path("_meta.json")])
+    if record.frame_clouds:
+        files += f"; {record.frame_clouds} clouds per frame in {record.options.save_per_frame_cloud_path}"
     if not result.ok or interrupted:
         found = f"interrupted; {result.message}" if interrupted else result.message
         raise TrackingError(f"{found}. Kept in {products.base.parent}: {files}")
     raw = 0 if result.observables is None else len(result.observables)
-    cleaned = "not cleaned" if cloud is None or not reports else f"{len(cloud)} after cleaning"
+    cleaned = "not cleaned" if record.cleaned_points is None else f"{record.cleaned_points} after cleaning"
     say(f"{result.message}; {raw} points, {cleaned}; {result.tracked_share:.0%} of the frames explained; "
         f"scale is arbitrary. Wrote to {products.base.parent}: {files}")
-
-
-def say(text: str) -> None:
-    """One line on stderr that does not tear the progress bar."""
-    tqdm.write(text, file=sys.stderr)

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from devo.poses import invert_poses_numpy, normalize_poses_numpy
-from utils.atomic import atomic_path
+from utils.array_files import save_arrays
 from utils.clouds.arrays import load_arrays
 from utils.clouds.table import reject
 
@@ -111,12 +111,7 @@ def write_frame_bundle(path: str | PathLike[str], bundle: FrameBundle) -> Path:
     Raises:
         OutputError: the file cannot be written.
     """
-    target = Path(path)
-    if target.suffix != ".npz":
-        target = target.with_name(target.name + ".npz")
-    with atomic_path(target) as temporary:
-        np.savez(temporary, **bundle.arrays())  # type: ignore[arg-type]
-    return target
+    return save_arrays(path, bundle.arrays())
 
 
 def read_frame_bundle(path: str | PathLike[str]) -> FrameBundle:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from typing import TypeVar
 
 from devo.errors import InputError
@@ -22,7 +22,7 @@ class _End:
         self.error = error
 
 
-def prefetch(items: Iterable[Item], look_ahead: int = LOOK_AHEAD) -> Iterator[Item]:
+def prefetch(items: Iterable[Item], look_ahead: int = LOOK_AHEAD) -> Generator[Item, None, None]:
     """The same items in the same order, made in a thread of their own, at most `look_ahead` in advance.
 
     Whatever the stream raises, `KeyboardInterrupt` included, is raised here in its place, after the items before it.
@@ -38,10 +38,10 @@ def prefetch(items: Iterable[Item], look_ahead: int = LOOK_AHEAD) -> Iterator[It
     """
     if look_ahead < 0:
         raise InputError(f"look_ahead is {look_ahead}; expected 0 (no thread) or more")
-    return _prefetch(items, look_ahead) if look_ahead else iter(items)
+    return _prefetch(items, look_ahead) if look_ahead else (item for item in items)
 
 
-def _prefetch(items: Iterable[Item], look_ahead: int) -> Iterator[Item]:
+def _prefetch(items: Iterable[Item], look_ahead: int) -> Generator[Item, None, None]:
     waiting: queue.Queue[Item | _End] = queue.Queue(look_ahead)
     stop = threading.Event()
     thread = threading.Thread(target=_produce, args=(items, waiting, stop), name="prefetch", daemon=True)

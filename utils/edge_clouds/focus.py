@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -64,7 +64,7 @@ class FocusPeak:
     Attributes:
         inv_depth: `(N,)`, refined between the samples.
         score: `(N,)`, height of the peak.
-        confidence: `(N,)`, peak over the strongest rival outside the guard band.
+        confidence: `(N,)`, peak over its strongest rival, see `_strongest_rival`.
         accepted: `(N,)` bool.
     """
 
@@ -88,7 +88,9 @@ def refine_edges(frames: Iterable[Frame], bundle: FrameBundle, settings: FocusSe
         image_dtype: type in which the images of the window wait; the window holds `2 support support_stride + 1`.
 
     Yields:
-        Per reference frame the accepted points with the scalars of `points_of_frame` and `score`, `confidence`.
+        Per reference frame the accepted points with the scalars of `points_of_frame` and `prior_inv_depth`, `score`,
+        `confidence`; the metadata `band_travel_px` says how far a pixel moves in the farthest image between the ends
+        of the tried band (pooled px, median). Below about 3 px nothing can be told apart.
 
     Raises:
         InputError: the recording and the bundle share no time stamp.
@@ -150,30 +152,36 @@ def _refine(reference: Slice, support: list[Slice], bundle: FrameBundle, setting
     rows, prior = interpolate_inv_depths(xy, *bundle.seeds(reference.frame, device), settings)
     xy = xy[rows]
     intrinsics = torch.from_numpy(bundle.intrinsics[reference.frame]).to(device)
-    peak = focus_peaks(xy, prior, intrinsics, reference.cam_T_world, support, settings)
+    tried = _tried(prior, settings)
+    peak = focus_peaks(xy, tried, intrinsics, reference.cam_T_world, support, settings)
     keep = peak.accepted
-    return points_of_frame(bundle, reference.frame, xy[keep], peak.inv_depth[keep], reference.crop,
-                           prior_inv_depth=prior[keep], score=peak.score[keep], confidence=peak.confidence[keep])
+    cloud = points_of_frame(bundle, reference.frame, xy[keep], peak.inv_depth[keep], reference.crop,
+                            prior_inv_depth=prior[keep], score=peak.score[keep], confidence=peak.confidence[keep])
+    travel = _band_travel(xy, tried, intrinsics, reference.cam_T_world, support, settings)
+    return replace(cloud, metadata={"band_travel_px": f"{travel:.3f}"})
 
 
-def focus_peaks(xy: Tensor, prior: Tensor, intrinsics: Tensor, cam_T_world: Tensor, support: list[Slice],
-                settings: FocusSettings) -> FocusPeak:
-    """Search the inverse depth of each pixel around its prior.
-
-    Args:
-        xy: `(N,2)` qres px in the reference camera. prior: `(N,)` inverse depths.
-        intrinsics: `(4,)` qres, the same for all images. cam_T_world: `(7,)` of the reference.
-        support: the images to look into.
-        settings: see `FocusSettings`.
-    """
+def _tried(prior: Tensor, settings: FocusSettings) -> Tensor:
+    """The inverse depths `(N,S)` that are tried around the priors `(N,)`."""
     width = prior * settings.rho_rel if settings.rho_abs is None else torch.full_like(prior, settings.rho_abs)
     steps = torch.linspace(-1.0, 1.0, settings.rho_samples, device=prior.device)
-    tried = (prior[:, None] + width[:, None] * steps).clamp(min=_MIN_INV_DEPTH)
+    return (prior[:, None] + width[:, None] * steps).clamp(min=_MIN_INV_DEPTH)
+
+
+def focus_peaks(xy: Tensor, tried: Tensor, intrinsics: Tensor, cam_T_world: Tensor, support: list[Slice],
+                settings: FocusSettings) -> FocusPeak:
+    """Choose among the tried inverse depths of each pixel.
+
+    Args:
+        xy: `(N,2)` qres px in the reference camera. tried: `(N,S)` inverse depths in ascending order.
+        intrinsics: `(4,)` qres, the same for all images. cam_T_world: `(7,)` of the reference.
+        support: the images to look into; without any no peak is accepted.
+        settings: see `FocusSettings`.
+    """
     if not support or len(xy) == 0:
-        empty = torch.zeros_like(prior)
-        return FocusPeak(prior, empty, empty, torch.zeros_like(prior, dtype=torch.bool))
-    scores = focus_scores(xy, tried, intrinsics, cam_T_world, support, settings)
-    return _find_peaks(tried, scores, settings)
+        empty = tried.new_zeros(len(tried))
+        return FocusPeak(empty, empty, empty, torch.zeros_like(empty, dtype=torch.bool))
+    return _find_peaks(tried, focus_scores(xy, tried, intrinsics, cam_T_world, support, settings), settings)
 
 
 def focus_scores(xy: Tensor, inv_depths: Tensor, intrinsics: Tensor, cam_T_world: Tensor, support: list[Slice],
@@ -186,10 +194,7 @@ def focus_scores(xy: Tensor, inv_depths: Tensor, intrinsics: Tensor, cam_T_world
     Returns:
         `(N,S)` float32. Images are sampled bilinearly and are 0 outside; a pixel behind a camera adds nothing.
     """
-    reference = SE3(cam_T_world.double()).inv()
-    others = SE3(torch.stack([item.cam_T_world for item in support]).double())
-    motion = others * SE3(reference.data.expand(len(support), 7).clone())
-    matrix = motion.matrix().float()  # (K,4,4): reference camera to the cameras of the support
+    matrix = _motions(cam_T_world, support)
     rays = camera_rays(xy.float(), intrinsics.float())
     radius = settings.patch_radius
     images = _shifted(torch.stack([item.image for item in support]).float(), radius)
@@ -197,6 +202,13 @@ def focus_scores(xy: Tensor, inv_depths: Tensor, intrinsics: Tensor, cam_T_world
     return torch.cat([
         _sample(rays[start:start + chunk], inv_depths[start:start + chunk], matrix, intrinsics, images, settings)
         for start in range(0, len(rays), chunk)])
+
+
+def _motions(cam_T_world: Tensor, support: list[Slice]) -> Tensor:
+    """Matrices `(K,4,4)` float32 from the reference camera to the cameras of the support."""
+    reference = SE3(cam_T_world.double()).inv().data
+    others = SE3(torch.stack([item.cam_T_world for item in support]).double())
+    return (others * SE3(reference.expand(len(support), 7).clone())).matrix().float()
 
 
 def _shifted(images: Tensor, radius: int) -> Tensor:
@@ -214,11 +226,7 @@ def _shifted(images: Tensor, radius: int) -> Tensor:
 def _sample(rays: Tensor, inv_depths: Tensor, matrix: Tensor, intrinsics: Tensor, images: Tensor,
             settings: FocusSettings) -> Tensor:
     """Scores `(n,S)` of a chunk; `rays (n,3)`, `inv_depths (n,S)`, `matrix (K,4,4)`, `images` of `_shifted`."""
-    rotated = rays @ matrix[:, :3, :3].mT  # (K,n,3)
-    seen = rotated[:, :, None] + inv_depths[None, :, :, None] * matrix[:, None, None, :3, 3]  # (K,n,S,3)
-    in_front = seen[..., 2] > _MIN_Z * inv_depths
-    projected = seen[..., :2] / torch.where(in_front, seen[..., 2], torch.ones_like(seen[..., 2]))[..., None]
-    in_qres = projected * intrinsics[:2] + intrinsics[2:]
+    in_qres, in_front = _project(rays, inv_depths, matrix, intrinsics)
     margin = settings.patch_radius + 1
     pooled = in_qres * (RES / settings.downsample) - settings.pixel_shift + margin
     size = torch.tensor([images.shape[3], images.shape[2]], device=rays.device)
@@ -226,6 +234,26 @@ def _sample(rays: Tensor, inv_depths: Tensor, matrix: Tensor, intrinsics: Tensor
     grid = torch.where(in_front[..., None], grid, torch.full_like(grid, -2.0))
     values = F.grid_sample(images, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
     return values.amax(dim=1).sum(dim=0)
+
+
+def _project(rays: Tensor, inv_depths: Tensor, matrix: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays `(n,3)` are seen at inverse depths `(n,S)`: qres px `(K,n,S,2)`, and whether in front `(K,n,S)`."""
+    rotated = rays @ matrix[:, :3, :3].mT
+    seen = rotated[:, :, None] + inv_depths[None, :, :, None] * matrix[:, None, None, :3, 3]
+    in_front = seen[..., 2] > _MIN_Z * inv_depths
+    projected = seen[..., :2] / torch.where(in_front, seen[..., 2], torch.ones_like(seen[..., 2]))[..., None]
+    return projected * intrinsics[:2] + intrinsics[2:], in_front
+
+
+def _band_travel(xy: Tensor, tried: Tensor, intrinsics: Tensor, cam_T_world: Tensor, support: list[Slice],
+                 settings: FocusSettings) -> float:
+    """Median over the pixels of the longest way between the ends of the band in any image [pooled px]."""
+    if not support or len(xy) == 0:
+        return 0.0
+    seen, in_front = _project(camera_rays(xy.float(), intrinsics), tried[:, [0, -1]], _motions(cam_T_world, support),
+                              intrinsics)
+    way = (seen[:, :, 1] - seen[:, :, 0]).norm(dim=-1) * in_front.all(dim=2)
+    return float(way.amax(dim=0).median()) * RES / settings.downsample
 
 
 def _find_peaks(tried: Tensor, scores: Tensor, settings: FocusSettings) -> FocusPeak:
@@ -246,12 +274,31 @@ def _find_peaks(tried: Tensor, scores: Tensor, settings: FocusSettings) -> Focus
     curvature = before - 2.0 * peak + after
     offset = torch.where(curvature < 0, 0.5 * (before - after) / curvature.clamp(max=-1e-12), 0.0).clamp(-0.5, 0.5)
     place = torch.where(first == last, centre + offset, 0.5 * (first + last))
-    rival_free = (position >= (first - settings.guard)[:, None]) & (position <= (last + settings.guard)[:, None])
-    rival = scores.masked_fill(rival_free, 0.0).amax(dim=1)
-    rival = torch.where(last - first > 2 * settings.guard + 1, top, rival)  # two equal peaks, or a plain
+    rival = _strongest_rival(scores, first, last, settings.guard)
+    gaps = at_top.sum(dim=1) < last - first + 1
+    two_peaks_or_a_plain = (last - first > 2 * settings.guard + 1) | (gaps & (last - first > settings.guard))
+    rival = torch.where(two_peaks_or_a_plain, top, rival)
     confidence = top / rival.clamp(min=_MIN_RIVAL)
     low = place.floor().clamp(0, samples - 2).long()
     start, end = (tried.gather(1, (low + step)[:, None])[:, 0] for step in (0, 1))
     inv_depth = start + (place - low) * (end - start)
     accepted = inside & (top > settings.min_score) & (confidence >= settings.min_peak_ratio)
     return FocusPeak(inv_depth, top, confidence, accepted)
+
+
+def _strongest_rival(scores: Tensor, first: Tensor, last: Tensor, guard: int) -> Tensor:
+    """The highest value `(N,)` that is not part of the peak `first .. last` of each row of `scores (N,S)`.
+
+    Part of the peak are `guard` samples on each side and, beyond them, its flanks as long as they fall. The sample at
+    the foot of a flank is a rival, so a lone peak has to rise above the ends of the band.
+    """
+    position = torch.arange(scores.shape[1], device=scores.device)
+    feet = []
+    for curve, start in ((scores, last), (scores.flip(1), scores.shape[1] - 1 - first)):
+        rises = torch.cat([curve[:, 1:] > curve[:, :-1], torch.ones_like(curve[:, :1], dtype=torch.bool)], dim=1)
+        stop = rises & (position >= (start + guard + 1).clamp(max=scores.shape[1] - 1)[:, None])
+        feet.append(stop.int().argmax(dim=1))
+    left, right = scores.shape[1] - 1 - feet[1], feet[0]
+    outside = (position <= left[:, None]) | (position >= right[:, None])
+    near = (position >= (first - guard)[:, None]) & (position <= (last + guard)[:, None])
+    return scores.masked_fill(~outside | near, 0.0).amax(dim=1)
