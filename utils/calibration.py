@@ -97,28 +97,34 @@ class Calibration:
 
 
 def read_calibration(path: str | os.PathLike[str], image_size: tuple[int, int] | None = None,
-                     fallback_size: tuple[int, int] | None = None) -> Calibration:
+                     fallback_size: tuple[int, int] | None = None, *, camera: str = "cam0",
+                     default_model: DistortionModel | None = None) -> Calibration:
     """Read a calibration file.
 
     `.yaml`, `.yml`, `.json`: `width height fx fy cx cy distortion_model distortion_coefficients`; instead of
     `fx fy cx cy` a list `intrinsics` or a `camera_matrix` (9 numbers, 3x3 or ROS `data`); instead of width and height
-    `resolution: [width, height]` or ROS `image_width`, `image_height`. A Kalibr camchain is read from its `cam0`.
+    `resolution: [width, height]` or ROS `image_width`, `image_height`. Of a Kalibr camchain, one camera is read.
     Any other ending: one line `fx fy cx cy [k1 k2 p1 p2 [k3]]`.
 
     Args:
         path: the file.
         image_size: (width, height); must agree with the file if that says a size, and is needed if it does not.
         fallback_size: (width, height) used only if neither `image_size` nor the file says it.
+        camera: which camera of a Kalibr camchain.
+        default_model: lens model of coefficients where the file does not name one.
 
     Raises:
         InputError: the file is missing, not readable as its format, incomplete or implausible (see `Calibration`).
     """
     path = Path(path)
-    fields = _read_text(path) if path.suffix.lower() not in (".yaml", ".yml", ".json") else _read_mapping(path)
+    if path.suffix.lower() not in (".yaml", ".yml", ".json"):
+        fields = _read_text(path)
+    else:
+        fields = _one_camera(path, read_mapping(path), camera)
     try:
         width, height = _choose_size(_size(fields), image_size, fallback_size)
         fx, fy, cx, cy = _intrinsics(fields)
-        model, coefficients = _distortion(fields)
+        model, coefficients = _distortion(fields, default_model)
         return Calibration(width, height, fx, fy, cx, cy, model, coefficients)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -138,7 +144,12 @@ def _read_text(path: Path) -> dict[str, Any]:
     return {"intrinsics": numbers[:4], "distortion_model": model, "distortion_coefficients": numbers[4:]}
 
 
-def _read_mapping(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Read the keys and values of a JSON or YAML file, that of OpenCV included.
+
+    Raises:
+        InputError: the file is missing, damaged or holds something else.
+    """
     try:
         text = path.read_text("utf-8")
     except OSError as error:
@@ -152,15 +163,26 @@ def _read_mapping(path: Path) -> dict[str, Any]:
             fields = yaml.safe_load(text.replace("%YAML:1.0", "").replace("!!opencv-matrix", ""))
     except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path}: not valid {path.suffix[1:]} ({' '.join(str(error).split())[:100]})") from None
-    if isinstance(fields, dict) and isinstance(fields.get("cam0"), dict):
-        fields = fields["cam0"]
     if not isinstance(fields, dict):
         raise InputError(f"{path}: expected keys such as width, height, fx, fy, cx, cy, found {type(fields).__name__}")
     return fields
 
 
-def _numbers(value: Any, name: str) -> list[float]:
-    """Return a flat list of numbers from a number, a nested list or a ROS matrix with `data`."""
+def _one_camera(path: Path, fields: dict[str, Any], camera: str) -> dict[str, Any]:
+    """Return the fields of one camera of a Kalibr camchain, or all fields of a file with one camera."""
+    if not any(isinstance(fields.get(name), dict) for name in ("cam0", camera)):
+        return fields
+    if not isinstance(fields.get(camera), dict):
+        raise InputError(f"{path}: no camera {camera}, found {', '.join(map(str, fields))}")
+    return dict(fields[camera])
+
+
+def flat_numbers(value: Any, name: str) -> list[float]:
+    """Return a flat list of numbers from a number, a nested list or a ROS matrix with `data`.
+
+    Raises:
+        InputError: the value is something else.
+    """
     if isinstance(value, dict):
         value = value.get("data")
     try:
@@ -176,7 +198,7 @@ def _size(fields: dict[str, Any]) -> tuple[int, int] | None:
         size = [fields.get(name, fields.get(f"image_{name}")) for name in ("width", "height")]
         if all(value is None for value in size):
             return None
-    numbers = _numbers(size, "image size")
+    numbers = flat_numbers(size, "image size")
     if len(numbers) != 2 or not all(math.isfinite(value) and value == int(value) for value in numbers):
         raise InputError(f"calibration: image size is {size}, expected whole numbers width and height")
     return int(numbers[0]), int(numbers[1])
@@ -196,11 +218,11 @@ def _choose_size(in_file: tuple[int, int] | None, given: tuple[int, int] | None,
 
 def _intrinsics(fields: dict[str, Any]) -> tuple[float, float, float, float]:
     if all(name in fields for name in ("fx", "fy", "cx", "cy")):
-        numbers = _numbers([fields[name] for name in ("fx", "fy", "cx", "cy")], "fx fy cx cy")
+        numbers = flat_numbers([fields[name] for name in ("fx", "fy", "cx", "cy")], "fx fy cx cy")
     elif "intrinsics" in fields:
-        numbers = _numbers(fields["intrinsics"], "intrinsics")
+        numbers = flat_numbers(fields["intrinsics"], "intrinsics")
     elif "camera_matrix" in fields:
-        numbers = _numbers(fields["camera_matrix"], "camera_matrix")
+        numbers = flat_numbers(fields["camera_matrix"], "camera_matrix")
         if len(numbers) == 9:
             if numbers[1] != 0 or numbers[3:4] + numbers[6:] != [0.0, 0.0, 0.0, 1.0]:
                 raise InputError(f"calibration: camera matrix {numbers} is not of the form fx 0 cx, 0 fy cy, 0 0 1")
@@ -214,10 +236,11 @@ def _intrinsics(fields: dict[str, Any]) -> tuple[float, float, float, float]:
     return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
-def _distortion(fields: dict[str, Any]) -> tuple[DistortionModel, tuple[float, ...]]:
+def _distortion(fields: dict[str, Any],
+                default_model: DistortionModel | None) -> tuple[DistortionModel, tuple[float, ...]]:
     values = fields.get("distortion_coefficients", fields.get("distortion_coeffs"))
-    coefficients = tuple(_numbers(values, "distortion coefficients")) if values is not None else ()
-    name = fields.get("distortion_model")
+    coefficients = tuple(flat_numbers(values, "distortion coefficients")) if values is not None else ()
+    name = fields.get("distortion_model", default_model)
     if name is None:
         if any(coefficients):
             raise InputError("calibration: distortion coefficients without distortion_model; say radtan or fisheye")

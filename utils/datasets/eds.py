@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devo.errors import InputError
-from utils.calibration import Calibration
+from utils.calibration import Calibration, read_mapping
 from utils.datasets.options import SequenceOptions
 from utils.datasets.prepared import (
     find_images,
@@ -18,7 +18,6 @@ from utils.datasets.prepared import (
     only_match,
     pinhole_of,
     poses_reader,
-    read_json,
     read_stamps,
     refuse_options,
     refuse_own_camera,
@@ -129,7 +128,7 @@ def undistorted_camera(path: Path, calibration: str, camera: str) -> npt.NDArray
     file = path / f"calib_undist_{calibration}.json"
     if not file.is_file():
         return np.array(_PUBLISHED_INTRINSICS[calibration][camera])
-    entries = read_json(file).get("intrinsics_undistorted")
+    entries = read_mapping(file).get("intrinsics_undistorted")
     try:
         return pinhole_of(entries[_JSON_ENTRY[camera]])  # type: ignore[index]
     except (KeyError, IndexError, TypeError, ValueError) as error:

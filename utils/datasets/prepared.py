@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -86,12 +85,20 @@ def read_stamps(path: Path) -> Stamps:
     Raises:
         InputError: see `read_image_list`, or stamps that do not increase.
     """
-    stamps = read_image_list(path, "us", whole=False).stamps_us
-    wrong = np.flatnonzero(np.diff(stamps) <= 0)
+    return require_increasing(read_image_list(path, "us", whole=False).stamps_us, path)
+
+
+def require_increasing(stamps_us: Stamps, path: Path) -> Stamps:
+    """Return the stamps of a file.
+
+    Raises:
+        InputError: they do not increase.
+    """
+    wrong = np.flatnonzero(np.diff(stamps_us) <= 0)
     if len(wrong):
-        raise InputError(f"{path}: stamp {wrong[0] + 1} is {stamps[wrong[0] + 1]} us and not later than the one "
+        raise InputError(f"{path}: stamp {wrong[0] + 1} is {stamps_us[wrong[0] + 1]} us and not later than the one "
                          "before it")
-    return stamps
+    return stamps_us
 
 
 def read_pinhole(path: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
@@ -116,23 +123,6 @@ def pinhole_of(fields: dict[str, Any]) -> npt.NDArray[np.float64]:
     if not np.isfinite(numbers).all() or numbers[:2].min() <= 0:
         raise ValueError(f"fx fy cx cy are {numbers.tolist()}")
     return numbers
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        InputError: the file is missing, damaged or holds something else.
-    """
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not valid JSON ({' '.join(str(error).split())[:100]})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected a JSON object, found {type(content).__name__}")
-    return content
 
 
 def mean_interval_us(stamps_us: Stamps, path: Path) -> float:

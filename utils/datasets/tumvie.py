@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devo.errors import InputError
-from utils.calibration import Calibration
+from utils.calibration import Calibration, read_mapping
 from utils.datasets.options import SequenceOptions
 from utils.datasets.prepared import (
     check_window_length,
@@ -19,7 +19,6 @@ from utils.datasets.prepared import (
     only_match,
     pinhole_of,
     poses_reader,
-    read_json,
     read_stamps,
     refuse_own_camera,
     require_files,
@@ -36,7 +35,8 @@ CALIBRATION_FILE = "calib_undist.json"
 EVENT_BALANCE, FRAME_BALANCE = 0.5, 0.0
 """How much of the fisheye view is kept: of the events, and of the undistorted images on disk."""
 
-_CAMERAS = {"left": 2, "right": 3}
+CAMERAS = {"left": 2, "right": 3}
+"""Number of the event camera of each side; 0 and 1 are the frame cameras."""
 
 
 def event_pattern(side: str) -> str:
@@ -46,7 +46,7 @@ def event_pattern(side: str) -> str:
 
 def frame_camera(side: str) -> int:
     """Return the number of the frame camera of a side: 0 left, 1 right; event cameras are 2 and 3."""
-    return _CAMERAS[side] - 2
+    return CAMERAS[side] - 2
 
 
 @register("tumvie", "TUM-VIE: stereo event cameras 1280x720, preprocessed by scripts/pp_tumvie.py")
@@ -92,7 +92,7 @@ def open_tumvie(path: Path, options: SequenceOptions, voxel_size: tuple[int, int
 
     return Sequence(
         path.resolve().name, path, bounded, size=EVENT_SIZE,
-        intrinsics=read_undistorted(path / CALIBRATION_FILE, _CAMERAS[side]), open_reader=open_reader, windows=windows,
+        intrinsics=read_undistorted(path / CALIBRATION_FILE, CAMERAS[side]), open_reader=open_reader, windows=windows,
         rectify_map=read_rectify_map(files["rectify map"], EVENT_SIZE), hot_pixel_stds=HOT_PIXEL_STDS,
         images=find_images(images, stamps, frame_intrinsics, command),
         read_ground_truth=poses_reader(poses, skip_lines=1), files=files, voxel_size=voxel_size)
@@ -104,7 +104,7 @@ def read_camera(path: Path, camera: int) -> Calibration:
     Raises:
         InputError: the file is missing or damaged, or lacks that camera.
     """
-    value = read_json(path).get("value0")
+    value = read_mapping(path).get("value0")
     try:
         fields = value["intrinsics"][camera]["intrinsics"]  # type: ignore[index]
         width, height = value["resolution"][camera]  # type: ignore[index]
@@ -122,7 +122,7 @@ def read_undistorted(path: Path, camera: int) -> npt.NDArray[np.float64]:
     Raises:
         InputError: the file is missing or damaged, or lacks that camera.
     """
-    value = read_json(path).get("value0")
+    value = read_mapping(path).get("value0")
     try:
         fields = value["intrinsics_undistorted"][camera]  # type: ignore[index]
         return pinhole_of(fields)
@@ -147,7 +147,7 @@ def tumvie_evs_iterator(scenedir: str | os.PathLike[str], camID: int = 2, stride
     Raises:
         InputError: see `open_tumvie`, or another camera.
     """
-    side = {camera: side for side, camera in _CAMERAS.items()}.get(camID)
+    side = {camera: side for side, camera in CAMERAS.items()}.get(camID)
     if side is None:
         raise InputError(f"camID is {camID}, expected 2 or 3: the left or the right event camera")
     options = SequenceOptions(side=side, stride=stride, window_dt_ms=dT_ms)

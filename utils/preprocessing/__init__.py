@@ -5,7 +5,7 @@ Importing this package fills `PREPROCESSORS`: each module reads the raw files of
 
 from __future__ import annotations
 
-from utils.preprocessing import ecd, fpv, hku, rpg  # noqa: F401 - importing them fills the table
+from utils.preprocessing import ecd, eds, fpv, hku, mvsec, rpg, tumvie, vector  # noqa: F401 - importing them fills the table
 from utils.preprocessing.registry import PREPROCESSORS, PreprocessOptions, Preprocessor, register
 from utils.preprocessing.runner import find_sequences, preprocess
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from devo.errors import InputError
 from utils.calibration import Calibration
+from utils.datasets.files import natural_order
 from utils.preprocessing.products import Image, Products, read_raw_image
 from utils.undistort import ImageUndistorter
 
@@ -29,15 +30,38 @@ def listed_images(folder: Path, names: list[str] | None, subfolder: Path, list_f
     return paths
 
 
+def counted_images(folder: Path, count: int) -> list[Path]:
+    """Return the `count` image files of a folder in natural order.
+
+    Raises:
+        InputError: the folder is missing or holds another number of images.
+    """
+    paths = natural_order(folder)
+    if len(paths) != count:
+        raise InputError(f"{folder}: {len(paths)} images for {count} stamps; unpack the recording again, or leave "
+                         "images out with --no-images")
+    return paths
+
+
 def undistort_files(products: Products, folder: Path, paths: list[Path], calibration: Calibration,
-                    intrinsics: npt.ArrayLike, interpolation: int | None = None) -> None:
-    """Write undistorted copies of image files, under the same names, into `folder`; see `Products.image_folder`."""
+                    intrinsics: npt.ArrayLike, interpolation: int | None = None, *, numbered: bool = False) -> None:
+    """Write undistorted copies of image files into `folder`; see `Products.image_folder`.
+
+    Args:
+        products: account of what is made.
+        folder: where to.
+        paths: the images.
+        calibration: their camera.
+        intrinsics: (4,) `fx fy cx cy` of the undistorted camera.
+        interpolation: OpenCV's flag, None for bicubic.
+        numbered: name the copies 000000.png, 000001.png, ... instead of keeping the names.
+    """
     def images() -> Iterator[tuple[str, Image]]:
         undistort = ImageUndistorter(calibration, intrinsics, *([] if interpolation is None else [interpolation]))
-        for path in paths:
+        for number, path in enumerate(paths):
             image = read_raw_image(path)
             try:
-                yield path.name, undistort(image)
+                yield f"{number:06d}.png" if numbered else path.name, undistort(image)
             except InputError as error:
                 raise InputError(f"{path}: {error}") from None
 

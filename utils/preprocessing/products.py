@@ -23,6 +23,7 @@ import numpy.typing as npt
 from devo.errors import InputError, OutputError
 from utils.atomic import atomic_folder, atomic_path
 from utils.calibration import Calibration, read_calibration
+from utils.datasets.files import natural_order
 from utils.preprocessing.registry import PreprocessOptions
 from utils.undistort import rectify_map, undistorted_intrinsics, write_rectify_map
 
@@ -131,4 +132,4 @@ def read_raw_image(path: Path) -> Image:
 
 
 def _count_images(folder: Path) -> int:
-    return sum(1 for file in folder.iterdir() if file.is_file()) if folder.is_dir() else 0
+    return len(natural_order(folder)) if folder.is_dir() else 0
