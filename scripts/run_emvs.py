@@ -26,7 +26,9 @@ def build_arg_parser() -> argparse.ArgumentParser:
     parser = AliasParser(prog="run_emvs.py", description=__doc__)
     add = parser.add_argument
     add("--out", required=True, help="beginning of the names of all outputs, for example results/board_emvs")
-    add("--datapath", help="folder of a generic recording: events.*, calib.*, groundtruth.txt")
+    add("--datapath", help="folder of a recording: events.*, calib.*, groundtruth.txt, or as --dataset has it")
+    add("--dataset", default="generic", help="data set of the folder; auto = recognised by its files")
+    add("--side", choices=("left", "right"), default="left", help="camera of a stereo data set")
     add("--events", help="event file, instead of that of the folder")
     add("--poses", help="camera poses: TUM text or <base>_poses.npy (default: groundtruth.txt of the folder)")
     add("--calib", help="calibration, instead of that of the folder")

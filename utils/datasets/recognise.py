@@ -321,11 +321,12 @@ def _explain(folder: Path, side: str, layouts: Sequence[Layout], own: bool) -> s
         other, absent = _look(folder, layout.ready, _OTHER[side], layout)
         looks.append((len(found) + (0 if absent else len(other)), layout, found, not absent))
     most = max((count for count, *_ in looks), default=0)
-    lines = [_lacks(folder, side, layout, found, other) for count, layout, found, other in looks if count == most > 0]
+    lines = [_lacks(folder, side, layout, found, other) for count, layout, found, other in looks
+             if count == most and (most or len(layouts) == 1)]
     if own:
         lines.append(f"a recording of your own needs an event file (events.h5, .raw, .bag, .txt, ...) and "
                      f"{' or '.join(CALIBRATION_NAMES)}, and has {_own_parts(folder)}")
-    return f"{folder} is not recognised as a recording: " + "; ".join(lines[:4] or ["none of its files is known"])
+    return f"{folder} is not recognised as a recording: " + "; ".join(lines[:4])
 
 
 def _lacks(folder: Path, side: str, layout: Layout, found: tuple[str, ...], other_side_is_ready: bool) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from utils.calibration import read_calibration
 from utils.clouds.io import read_cloud
 from utils.datasets.generic import CALIBRATION_NAMES, find_event_file
 from utils.datasets.options import SequenceOptions
+from utils.datasets.recognise import GENERIC
+from utils.datasets.registry import Sequence, open_sequence
 from utils.emvs.convention import ConventionCheck, PacketSample, check_convention
 from utils.emvs.mapper import EmvsMap, EventCamera, map_events
 from utils.emvs.products import base_path, write_products
@@ -28,6 +31,7 @@ from utils.events.reader import EventReader, open_events
 from utils.events.types import Events
 from utils.trajectory_io import Trajectory, inverted, read_npy, read_tum
 from utils.undistort import rectify_map
+from utils.voxel_grid import scale_intrinsics
 
 _TUM_UNITS = {"tum_s": "s", "tum_us": "us"}
 
@@ -38,6 +42,8 @@ class EmvsOptions:
 
     out: str
     datapath: str | None = None
+    dataset: str = GENERIC
+    side: str = "left"
     events: str | None = None
     poses: str | None = None
     calib: str | None = None
@@ -59,8 +65,23 @@ class EmvsOptions:
         return (self.image_size[0], self.image_size[1]) if self.image_size else None
 
 
-def run_emvs(options: EmvsOptions) -> EmvsMap:
+@dataclass(frozen=True)
+class _Source:
+    """Events, camera and poses of one run; `files` and `calibration` describe them."""
+
+    open_events: Callable[[], EventReader]
+    event_camera: EventCamera
+    trajectory: Trajectory
+    files: dict[str, Path]
+    calibration: dict[str, Any]
+
+
+def run_emvs(options: EmvsOptions, sequence: Sequence | None = None) -> EmvsMap:
     """Map a recording and write every product next to `options.out`.
+
+    Args:
+        options: what was asked for.
+        sequence: where events and camera come from; None opens what the options name.
 
     Raises:
         InputError: unusable arguments or input.
@@ -69,13 +90,12 @@ def run_emvs(options: EmvsOptions) -> EmvsMap:
     """
     started = time.perf_counter()
     device = resolve_device(options.device)
-    files = _find_files(options)
-    trajectory = read_poses(files["poses"], options.pose_format, options.pose_convention)
+    source = _from_files(options) if sequence is None and options.dataset == GENERIC else _from_sequence(
+        options, sequence)
+    trajectory, event_camera = source.trajectory, source.event_camera
     sparse = None if options.cloud is None else _read_sparse(options)
-    calibration = read_calibration(files["calib"], options.size, _size_in(files["events"]))
-    event_camera = EventCamera(*rectify_map(calibration))
     sample = PacketSample(options.settings.packet_size)
-    with open_events(files["events"], sensor_size=event_camera.size) as reader:
+    with source.open_events() as reader:
         start_us, stop_us = _window_us(reader, trajectory, options)
         with tqdm(unit=" events", unit_scale=True, desc="voting", file=sys.stderr, disable=None) as bar:
             def on_events(events: Events) -> None:
@@ -85,7 +105,7 @@ def run_emvs(options: EmvsOptions) -> EmvsMap:
             result = map_events(reader, trajectory, event_camera, options.settings, start_us=start_us, stop_us=stop_us,
                                 sparse_points=sparse, device=device, keep_dsi=options.save_dsi, on_events=on_events)
     check = _check(result, sample, trajectory, event_camera, options, device) if options.check_poses else None
-    meta = _describe(result, options, files, calibration.as_dict(), event_camera, check, device)
+    meta = _describe(result, options, source, check, device)
     meta["total_s"] = round(time.perf_counter() - started, 2)
     written = write_products(base_path(options.out), result, meta, pictures=options.pictures, dsi=options.save_dsi)
     _report(result, check, written)
@@ -111,6 +131,43 @@ def read_poses(path: Path, pose_format: str = "auto", convention: str = "auto") 
     if convention == "T_cw":
         return Trajectory(trajectory.t_us, inverted(trajectory.world_T_cam))
     return trajectory
+
+
+def _from_files(options: EmvsOptions) -> _Source:
+    """A recording of one's own, or single files."""
+    files = _find_files(options)
+    trajectory = read_poses(files["poses"], options.pose_format, options.pose_convention)
+    calibration = read_calibration(files["calib"], options.size, _size_in(files["events"]))
+    camera = EventCamera(*rectify_map(calibration))
+    return _Source(lambda: open_events(files["events"], sensor_size=camera.size), camera, trajectory, files,
+                   calibration.as_dict())
+
+
+def _from_sequence(options: EmvsOptions, sequence: Sequence | None) -> _Source:
+    """A sequence of a data set, as its reader opens it."""
+    if sequence is None:
+        if options.datapath is None or options.events or options.calib:
+            raise InputError(f"--dataset {options.dataset} needs --datapath FOLDER, without --events and --calib")
+        opened = open_sequence(options.dataset, options.datapath, SequenceOptions(side=options.side))
+        if not isinstance(opened, Sequence):
+            raise InputError(f"{options.datapath}: {options.dataset} holds voxel grids, but EMVS needs events")
+        sequence = opened
+    files = {role: Path(path) for role, path in sequence.describe()["files"].items()}
+    truth = sequence.ground_truth() if options.poses is None else None
+    if options.poses is not None:
+        files["poses"] = Path(options.poses)
+        trajectory = read_poses(files["poses"], options.pose_format, options.pose_convention)
+    elif truth is not None:
+        trajectory = Trajectory(*truth)
+    else:
+        raise InputError(f"{sequence.path}: there is no ground truth, so --poses is needed")
+    width, height = sequence.sensor_size
+    positions = sequence.rectify_map
+    if positions is None:  # the events are undistorted already
+        positions = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    intrinsics = scale_intrinsics(sequence.intrinsics, (sequence.width, sequence.height), sequence.sensor_size)
+    return _Source(sequence.open_events, EventCamera(positions, intrinsics), trajectory, files,
+                   {"width": width, "height": height, "intrinsics_fx_fy_cx_cy": intrinsics.tolist()})
 
 
 def _find_files(options: EmvsOptions) -> dict[str, Path]:
@@ -170,8 +227,8 @@ def _check(result: EmvsMap, sample: PacketSample, trajectory: Trajectory, event_
     return check_convention(fullest, sample.events, PoseTrack(trajectory), event_camera, options.settings, device)
 
 
-def _describe(result: EmvsMap, options: EmvsOptions, files: dict[str, Path], calibration: dict[str, Any],
-              event_camera: EventCamera, check: ConventionCheck | None, device: torch.device) -> dict[str, Any]:
+def _describe(result: EmvsMap, options: EmvsOptions, source: _Source, check: ConventionCheck | None,
+              device: torch.device) -> dict[str, Any]:
     from devo import __version__
 
     asked = dataclasses.asdict(options)
@@ -179,8 +236,8 @@ def _describe(result: EmvsMap, options: EmvsOptions, files: dict[str, Path], cal
         "method": "EMVS, Rebecq et al. 2018 (see utils/emvs/__init__.py, patent application WO/2018/037079)",
         "pose_convention": "T_world_cam", "pose_order": "tx ty tz qx qy qz qw", "unit": "that of the poses",
         "settings": asked.pop("settings"), "options": asked,
-        "input": {name: str(path) for name, path in files.items()}, "calibration": calibration,
-        "undistorted_fx_fy_cx_cy": event_camera.intrinsics.tolist(), "points": len(result.cloud),
+        "input": {name: str(path) for name, path in source.files.items()}, "calibration": source.calibration,
+        "undistorted_fx_fy_cx_cy": source.event_camera.intrinsics.tolist(), "points": len(result.cloud),
         "views": [view.describe() for view in result.views], **result.counts,
         "convention_check": None if check is None else {**dataclasses.asdict(check), "suspicious": check.suspicious},
         "device": str(device), "torch": torch.__version__, "version": __version__,
