@@ -9,8 +9,7 @@ import numpy as np
 from devo.errors import InputError
 from utils.clouds.cloud import PointCloud
 from utils.plots.coloring import ARBITRARY, colorings_of
-from utils.plots.draw import draw_color_bar, draw_perspective, draw_plane, new_figure, point_size, write_texts
-from utils.plots.pages import PLANES, save_page
+from utils.plots.pages import overview_page, save_figure
 from utils.plots.scene import Scene
 
 __all__ = ["ARBITRARY", "save_preview"]
@@ -47,13 +46,4 @@ def save_preview(
     if color_by not in colorings_of(cloud):
         raise InputError(f"color_by must be one of {', '.join(colorings_of(cloud))}, found {color_by!r}")
     scene = Scene.build(cloud, world_T_cam, color_by, unit=unit)
-    figure = new_figure(16, 9)
-    draw_perspective(figure, (0.02, 0.085, 0.575, 0.80), scene)
-    size = 0.55 * point_size(scene)
-    for row, (plane, name) in enumerate((("xz", "top view"), ("yz", "side view"), ("xy", "front view"))):
-        place = (0.645, 0.6875 - 0.30 * row, 0.325, 0.205)
-        # seen from the front the path lies over the structure and would hide it
-        draw_plane(figure, place, scene, PLANES[plane], name, size, path_alpha=0.45 if plane == "xy" else 1.0)
-    draw_color_bar(figure, (0.03, 0.04, 0.17, 0.012), scene)
-    write_texts(figure, scene, title)
-    save_page(figure, path)
+    save_figure(overview_page(scene, title=title), path)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 BACKGROUND, PANEL, GRID, TEXT, FAINT = "#0e1116", "#151a21", "#2a313c", "#e6e9ee", "#97a1b0"
 PATH, START, END, PLAIN = "#ff6f61", "#7ee787", "#ffffff", "#8fb4d9"
+AXIS_COLORS = ("#ff7b72", "#7ee787", "#79c0ff")
 Place = tuple[float, float, float, float]
 _START_MARKER: dict[str, Any] = {"marker": "o", "color": START, "markersize": 11, "markerfacecolor": "none",
                                  "markeredgewidth": 2, "linestyle": ""}
@@ -47,7 +48,7 @@ def color_map() -> Any:
     return ListedColormap(colormaps["viridis"](np.linspace(0.2, 1.0, 256)))
 
 
-def point_size(scene: Scene) -> float:
+def point_size_of(scene: Scene) -> float:
     """Marker area in square points: small where many points are drawn."""
     return float(np.clip(40_000 / max(len(scene.cloud), 1), 1.2, 9.0))
 
@@ -107,7 +108,7 @@ def _stage(scene: Scene, look: npt.ArrayLike) -> FloatArray:
 
 
 def draw_perspective(figure: Figure, place: Place, scene: Scene, look: npt.ArrayLike = LOOK,
-                     size: float | None = None) -> None:
+                     size: float | None = None, faint_points: bool = False) -> None:
     """The scene in perspective on a stage of grid lines, with the directions of the world axes in the corner.
 
     Args:
@@ -116,6 +117,7 @@ def draw_perspective(figure: Figure, place: Place, scene: Scene, look: npt.Array
         scene: what.
         look: viewing direction in world axes.
         size: marker area in square points; None chooses one by the number of points.
+        faint_points: let the path stand out.
     """
     from matplotlib.collections import LineCollection
 
@@ -125,8 +127,8 @@ def draw_perspective(figure: Figure, place: Place, scene: Scene, look: npt.Array
     axes.add_collection(LineCollection(list(stage), colors=GRID, linewidths=0.6, alpha=0.8))
     image, distance = project(scene.points, scene, look)
     order = np.argsort(-distance, kind="stable")
-    area = 1.3 * point_size(scene) if size is None else size
-    scatter_points(axes, scene, image, order, area / distance**2, alpha=0.9)
+    area = 1.3 * point_size_of(scene) if size is None else size
+    scatter_points(axes, scene, image, order, area / distance**2, alpha=0.4 if faint_points else 0.9)
     draw_path(axes, scene, lambda world: project(world, scene, look)[0])
     set_equal_limits(figure, axes, stage.min(axis=(0, 1)), stage.max(axis=(0, 1)))
     _draw_triad(figure, place, look)
@@ -177,7 +179,7 @@ def draw_plane(figure: Figure, place: Place, scene: Scene, shown: tuple[int, int
     axes = dark_axes(figure, place, title, *labels)
     away = {0, 1, 2} - set(shown)
     order = np.argsort(scene.points[:, away.pop()], kind="stable")[::-1]
-    area = point_size(scene) if size is None else size
+    area = point_size_of(scene) if size is None else size
     scatter_points(axes, scene, scene.points[:, list(shown)], order, area, alpha=0.8,
                    rasterized=len(scene.cloud) > 20_000)
     draw_path(axes, scene, lambda world: world[..., list(shown)], path_alpha)

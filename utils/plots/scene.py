@@ -50,7 +50,7 @@ class Scene:
     @staticmethod
     def build(cloud: PointCloud, world_T_cam: npt.ArrayLike, color_by: str = "depth", *, unit: str = ARBITRARY,
               most_points: int = MOST_POINTS, show_outside: bool = False, pyramid: FloatArray | None = None,
-              frustum_scale: float | None = None) -> Scene:
+              frustum_scale: float | None = None, robust: bool = True) -> Scene:
         """Choose what is shown.
 
         Args:
@@ -62,6 +62,7 @@ class Scene:
             show_outside: draw the points beyond the box too (they are counted in any case).
             pyramid: shape of the cameras, see `camera_pyramid`; None takes one of 4:3.
             frustum_scale: length of the camera pyramids; None chooses one by the size of the scene.
+            robust: leave the far tails of the points out of the box.
 
         Raises:
             InputError: poses of another shape, an unknown colouring, or a length that is not positive.
@@ -71,7 +72,7 @@ class Scene:
             raise InputError(f"world_T_cam must have shape (T, 7), found {poses.shape}")
         poses = poses[np.isfinite(poses).all(axis=1)]
         finite = cloud.select(cloud.finite_mask())
-        low, high = robust_box(finite.points, poses[:, :3])
+        low, high = box_around(finite.points, poses[:, :3], robust)
         inside: npt.NDArray[np.bool_] = np.all((finite.points >= low) & (finite.points <= high), axis=1)
         drawn = finite if show_outside else finite.select(inside)
         drawn = drawn.select(np.linspace(0, len(drawn) - 1, min(len(drawn), most_points)).astype(np.int64))
@@ -125,10 +126,13 @@ class Scene:
         return "    ".join(parts)
 
 
-def robust_box(points: npt.NDArray[np.floating], centers: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners of the box that is shown: all camera centres `(T, 3)`, and points `(N, 3)` without their far tails."""
+def box_around(points: npt.NDArray[np.floating], centers: FloatArray,
+               robust: bool = True) -> tuple[FloatArray, FloatArray]:
+    """Corners of the box that is shown: camera centres `(T, 3)`, and points `(N, 3)` (robust: without far tails)."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    if len(points):
+    if len(points) and not robust:
+        low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    elif len(points):
         p1, p10, p90, p99 = np.percentile(points.astype(np.float64), (1, 10, 90, 99), axis=0)
         reach = 0.4 * (p90 - p10)  # holds 99 % of a normal distribution
         low, high = np.maximum(p1, p10 - reach), np.minimum(p99, p90 + reach)
