@@ -23,6 +23,8 @@ def add_focus_options(group: argparse._ArgumentGroup) -> None:
     """Add `--focus_*`: the edge options and how depths are refined."""
     add_edge_options(group, "focus")
     add = group.add_argument
+    add("--focus_edges", choices=("ridge", "sobel"), default="ridge",
+        help="pixels on the ridges of the event image, or on their flanks as published")
     add("--focus_support", type=int, default=4, help="event images looked into on each side")
     add("--focus_support_stride", type=int, default=1, help="distance between them [images]; raise it for slow motion")
     add("--focus_rho_samples", type=int, default=25, help="inverse depths tried per pixel")

@@ -154,18 +154,34 @@ def _run(frames: Iterable[Frame], cfg: Config, network: NetworkLike, *, return_o
          frame_mode: str = "final", timing: bool = False, debug: bool = False, save_per_frame_cloud: bool = False,
          save_per_frame_cloud_path: str | PathLike[str] = "results/clouds", voxel_size: float = 0.05,
          accumulate_map: bool = False, full_map_out: str | PathLike[str] | None = None,
-         full_map_color_out: str | PathLike[str] | None = None, **options: Any) -> tuple[Any, ...]:
+         full_map_color_out: str | PathLike[str] | None = None, export_edge_cloud: bool = False,
+         edge_cloud_out: str | PathLike[str] | None = None, **options: Any) -> tuple[Any, ...]:
     """What the three published drivers share."""
+    from utils.edge_clouds.edges import EdgeRecorder
+    from utils.edge_clouds.settings import EdgeSettings
     from utils.map_recorder import MapRecorder
 
     if return_colors and not return_observables:
         raise ValueError("return_colors needs return_observables=True")
-    wants_frames = return_frame_observables or record_frame_observables
+    chosen = {name: options.pop(f"edge_{name}") for name in ("downsample", "topk", "border", "knn", "max_dist")
+              if f"edge_{name}" in options}
+    if export_edge_cloud and edge_cloud_out is None:
+        raise InputError("export_edge_cloud needs to know where to write; pass edge_cloud_out=FILE")
+    edges = EdgeRecorder(EdgeSettings(**chosen)) if export_edge_cloud else None
+    wants_frames = return_frame_observables or record_frame_observables or edges is not None
     recorder = MapRecorder(Path(save_per_frame_cloud_path) if save_per_frame_cloud else None, voxel_size,
                            full_map_out, full_map_color_out)
-    result = track(frames, cfg, network, observables=return_observables, colors=return_colors,
-                   frame_mode=frame_mode if wants_frames else None, on_frame=recorder.on_frame, on_end=recorder.on_end,
-                   accumulate_map=accumulate_map or recorder.wants_map, **options)
+
+    def on_frame(tracker: DEVO) -> None:
+        recorder.on_frame(tracker)
+        if edges is not None:
+            edges.on_frame(tracker)
+
+    result = track(frames if edges is None else edges.tap(frames), cfg, network, observables=return_observables,
+                   colors=return_colors, frame_mode=frame_mode if wants_frames else None, on_frame=on_frame,
+                   on_end=recorder.on_end, accumulate_map=accumulate_map or recorder.wants_map, **options)
+    if edges is not None and edge_cloud_out is not None:
+        edges.write(edge_cloud_out, result.frame_data or [])
     if timing or debug:
         total = sum(result.timings.values())
         tqdm.write(f"{result.message}; {total:.1f} s: " + ", ".join(f"{k} {v:.1f}" for k, v in result.timings.items()))
@@ -204,7 +220,9 @@ def run_voxel(
             and `combined_map.ply`, the accumulated map down-sampled to `voxel_size` (trajectory units).
         accumulate_map, full_map_out, full_map_color_out: write the accumulated map (last estimate of every patch the
             run ever had) as `(K,3)` float32 and its colours as `(K,3)` uint8.
-        kwargs: further options of `track` (`seed`, `device`, `progress`, `frame_mode`, ...).
+        kwargs: further options of `track` (`seed`, `device`, `progress`, `frame_mode`, ...), and
+            `export_edge_cloud=True, edge_cloud_out=FILE` with `edge_downsample`, `edge_topk`, `edge_border`, `edge_knn`
+            and `edge_max_dist`: write the edge cloud, see `utils.edge_clouds`.
 
     Returns:
         `(poses, tstamps, flowdata[, point_cloud, depths[, colors]][, frame_data])`: poses `(T,7)` `world_T_cam`, time

@@ -77,6 +77,7 @@ class ExportOptions:
     focus_knn: int = 4
     focus_max_dist: float = 6.0
     focus_legacy_pixels: bool = False
+    focus_edges: str = "ridge"
     focus_support: int = 4
     focus_support_stride: int = 1
     focus_rho_samples: int = 25

@@ -12,18 +12,22 @@ from devo.lietorch import SE3
 from tests.oracle import HEIGHT, INTRINSICS, WIDTH, OracleScene
 
 FRAME_US = 10_000
-DOTS = 500
+DOTS_PER_VIEW = 400  # 2 % of the cells of a voxel grid have to be filled
 
 
-def wall_points(scene: OracleScene, count: int = DOTS, seed: int = 0, margin: float = 0.0) -> Tensor:
-    """World points `(count,3)` float64 on the walls, seen in the middle frame at least `margin` of it off the border."""
+def wall_points(scene: OracleScene, count: int, seed: int = 0, margin: float = 0.0, frame: int | None = None) -> Tensor:
+    """World points `(count,3)` float64 on the walls.
+
+    They are seen in a frame (default: the middle one), at least the share `margin` of its size off the border.
+    """
     generator = torch.Generator().manual_seed(seed)
-    frame = torch.full((count,), len(scene.cam_T_world.data) // 2)
+    frames = len(scene.cam_T_world.data)
+    host = torch.full((count,), frames // 2 if frame is None else frame)
     share = margin + (1.0 - 2.0 * margin) * torch.rand(count, 2, generator=generator, dtype=torch.float64)
     pixel = share * torch.tensor([WIDTH, HEIGHT])
-    inv_depth = scene.inv_depth(frame, pixel, INTRINSICS.double())
+    inv_depth = scene.inv_depth(host, pixel, INTRINSICS.double())
     ray = torch.cat([(pixel - INTRINSICS[2:]) / INTRINSICS[:2], torch.ones(count, 1)], dim=1)
-    return SE3(scene.world_T_cam.data[frame]).act(ray / inv_depth[:, None])
+    return SE3(scene.world_T_cam.data[host]).act(ray / inv_depth[:, None])
 
 
 def project(scene: OracleScene, points: Tensor, frame: int) -> Tensor:
@@ -35,8 +39,10 @@ def project(scene: OracleScene, points: Tensor, frame: int) -> Tensor:
 
 def write_recording(path: Path, scene: OracleScene) -> Path:
     """An event file `(x y t p)` in which every dot fires in every time bin of every frame of `FRAME_US`."""
-    points, columns = wall_points(scene), []
-    for frame in range(len(scene.cam_T_world.data)):
+    frames, columns = len(scene.cam_T_world.data), []
+    views = (0, frames // 3, 2 * frames // 3, frames - 1)
+    points = torch.cat([wall_points(scene, DOTS_PER_VIEW, seed=view, frame=view) for view in views])
+    for frame in range(frames):
         pixel = torch.round(project(scene, points, frame)).numpy()
         inside = (pixel >= 0).all(axis=1) & (pixel[:, 0] < WIDTH) & (pixel[:, 1] < HEIGHT)
         times = frame * FRAME_US + np.linspace(1, FRAME_US - 1, 6).astype(np.int64)

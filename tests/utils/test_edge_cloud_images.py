@@ -17,6 +17,7 @@ from utils.edge_clouds.images import (
     interpolate_inv_depths,
     normalised,
     pooled_to_qres,
+    ridge_pixels,
 )
 from utils.edge_clouds.settings import EdgeSettings, FocusSettings
 
@@ -68,6 +69,22 @@ def test_edge_pixels_are_the_strongest_sobel_responses(seed: int, topk: int, bor
     assert (np.diff(order) > 0).all()
 
 
+def test_ridges_are_where_the_edge_is_and_gradients_beside_it() -> None:
+    """A straight blurred edge: the ridge is found on the line, the Sobel edges one pixel off on both sides."""
+    rows, columns = torch.meshgrid(torch.arange(20.0), torch.arange(24.0), indexing="ij")
+    image = torch.exp(-0.5 * (columns - 11.0 - 0.0 * rows) ** 2)
+    ridge = ridge_pixels(image, 16, 2)
+    assert ridge[:, 0].tolist() == [11] * 16 and ridge[:, 1].tolist() == list(range(2, 18))
+    assert set(edge_pixels(image, 32, 2)[:, 0].tolist()) == {10, 12}
+    slanted = torch.exp(-0.5 * (columns - rows - 2.0) ** 2)
+    found = ridge_pixels(slanted, 14, 2)
+    assert bool((found[:, 0] - found[:, 1] == 2).all()) and len(found) == 14
+    plateau = torch.zeros(8, 8)
+    plateau[:, 3:5] = 1.0  # a ridge that falls between two columns
+    assert set(ridge_pixels(plateau, 64, 1)[:, 0].tolist()) <= {3, 4}
+    assert len(ridge_pixels(torch.ones(9, 9), 50, 2)) == 0
+
+
 def test_a_flat_or_broken_image_has_no_edges() -> None:
     assert len(edge_pixels(torch.full((10, 10), 3.0), 50, 1)) == 0
     broken = torch.zeros(10, 10)
@@ -110,7 +127,7 @@ def test_normalisation_forgets_how_many_events_there_were() -> None:
     (EdgeSettings, {"max_dist": float("nan")}, "edge_max_dist"), (FocusSettings, {"support": 0}, "focus_support"),
     (FocusSettings, {"rho_samples": 5}, "focus_guard"), (FocusSettings, {"rho_rel": 1.0}, "focus_rho_rel"),
     (FocusSettings, {"rho_abs": 0.0}, "focus_rho_abs"), (FocusSettings, {"max_keyframes": -1}, "focus_max_keyframes"),
-    (FocusSettings, {"min_score": float("inf")}, "focus_min_score"),
+    (FocusSettings, {"edges": "canny"}, "focus_edges"), (FocusSettings, {"min_score": float("inf")}, "focus_min_score"),
 ])
 def test_settings_that_make_no_sense_are_refused(kind: type, values: dict, word: str) -> None:
     with pytest.raises(InputError, match=word):

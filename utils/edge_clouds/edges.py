@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +14,7 @@ from torch import Tensor
 from devo.devo import DEVO
 from devo.lietorch import SE3
 from utils.clouds.cloud import PointCloud
+from utils.clouds.io import write_cloud
 from utils.edge_clouds.images import (
     camera_rays,
     crop_of,
@@ -62,6 +66,17 @@ class EdgeRecorder:
                 rows, inv_depths = interpolate_inv_depths(xy, *bundle.seeds(i), self.settings)
                 parts.append(points_of_frame(bundle, i, xy[rows], inv_depths, self.crop))
         return PointCloud.concat(parts)
+
+    def write(self, out: str | PathLike[str], frame_data: Sequence[dict[str, Any]]) -> None:
+        """Write the cloud of `TrackingResult.frame_data`; a missing suffix becomes `.npy`.
+
+        Raises:
+            InputError: an unknown suffix.
+            OutputError: the file cannot be written.
+        """
+        target = Path(out)
+        write_cloud(target if target.suffix else target.with_name(target.name + ".npy"),
+                    self.cloud(FrameBundle.from_frames(frame_data)))
 
 
 def points_of_frame(bundle: FrameBundle, i: int, xy: Tensor, inv_depths: Tensor, crop: tuple[int, int],

@@ -31,6 +31,7 @@ from utils.edge_clouds.images import (
     interpolate_inv_depths,
     normalised,
     pooled_to_qres,
+    ridge_pixels,
 )
 from utils.edge_clouds.settings import FocusSettings
 from utils.eval_utils import Frame
@@ -147,7 +148,8 @@ def _baseline(a: Slice, b: Slice) -> float:
 def _refine(reference: Slice, support: list[Slice], bundle: FrameBundle, settings: FocusSettings) -> PointCloud:
     """The refined points of one slice."""
     device = reference.image.device
-    pixels = edge_pixels(reference.image.float(), settings.topk, settings.border)
+    find = ridge_pixels if settings.edges == "ridge" else edge_pixels
+    pixels = find(reference.image.float(), settings.topk, settings.border)
     xy = pooled_to_qres(pixels, settings)
     rows, prior = interpolate_inv_depths(xy, *bundle.seeds(reference.frame, device), settings)
     xy = xy[rows]

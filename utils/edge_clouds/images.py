@@ -66,11 +66,31 @@ def edge_pixels(image: Tensor, topk: int, border: int) -> Tensor:
     """
     kernels = torch.stack([_SOBEL_X, _SOBEL_X.T])[:, None].to(image.device)
     gradient = F.conv2d(image[None, None], kernels, padding=1)[0].norm(dim=0)
+    return _strongest(gradient, topk, border)
+
+
+def ridge_pixels(image: Tensor, topk: int, border: int) -> Tensor:
+    """The brightest pixels on the ridges of a pooled event image: brighter than neighbours on opposite sides.
+
+    An edge of the scene leaves a ridge of events; the gradient of the image is largest on its two flanks and vanishes
+    on the ridge itself. Arguments and result as for `edge_pixels`.
+    """
     height, width = image.shape
-    inside = gradient.new_zeros(height, width)
+    padded = F.pad(image, (1, 1, 1, 1))
+    shifted = [padded[1 + dy:1 + dy + height, 1 + dx:1 + dx + width] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    on_ridge = torch.zeros_like(image, dtype=torch.bool)
+    for one, other in zip(shifted[:4], reversed(shifted[5:])):  # >= on one side: a ridge may be two pixels wide
+        on_ridge |= (image > one) & (image >= other)
+    return _strongest(image * on_ridge, topk, border)
+
+
+def _strongest(strength: Tensor, topk: int, border: int) -> Tensor:
+    """Columns and rows `(N,2)` of the largest positive, finite values of an image away from its border."""
+    height, width = strength.shape
+    inside = strength.new_zeros(height, width)
     inside[border:max(height - border, border), border:max(width - border, border)] = 1.0
-    strength = torch.nan_to_num(gradient * inside, nan=0.0, posinf=0.0).flatten()
-    values, index = strength.topk(min(topk, strength.numel()))
+    flat = torch.nan_to_num(strength * inside, nan=0.0, posinf=0.0).flatten()
+    values, index = flat.topk(min(topk, flat.numel()))
     index = index[values > 0].sort().values
     return torch.stack([index % width, torch.div(index, width, rounding_mode="floor")], dim=1)
 

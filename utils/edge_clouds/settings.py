@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from devo.errors import InputError
 
+FOCUS_EDGES = ("ridge", "sobel")
+
 
 @dataclass(frozen=True)
 class EdgeSettings:
@@ -56,6 +58,8 @@ class FocusSettings(EdgeSettings):
     """How depths of edge pixels are refined: the right depth is the one at which neighbouring event images agree.
 
     Attributes:
+        edges: `ridge` (where the event image is brightest) or `sobel` (where its gradient is largest, as published: the
+            flanks of the ridges, which other images do not show at the same place).
         support: neighbouring images used on each side. support_stride: distance between them [images].
         rho_samples: inverse depths tried per pixel. rho_rel: half-width of the tried band relative to the prior.
         rho_abs: half-width in absolute inverse depth; replaces rho_rel if given.
@@ -69,6 +73,7 @@ class FocusSettings(EdgeSettings):
         InputError: a value that makes no sense.
     """
 
+    edges: str = "ridge"
     support: int = 4
     support_stride: int = 1
     rho_samples: int = 25
@@ -86,6 +91,8 @@ class FocusSettings(EdgeSettings):
         self._check("focus")
         self._at_least("focus", support=1, support_stride=1, rho_samples=3, patch_radius=0, guard=0,
                        keyframe_stride=1, max_keyframes=0)
+        if self.edges not in FOCUS_EDGES:
+            raise InputError(f"--focus_edges is {self.edges!r}; expected one of {', '.join(FOCUS_EDGES)}")
         width = self.rho_rel if self.rho_abs is None else self.rho_abs
         name = "rho_rel" if self.rho_abs is None else "rho_abs"
         if not (width > 0 and math.isfinite(width)):
