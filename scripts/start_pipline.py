@@ -4,7 +4,7 @@
 Example: python scripts/start_pipline.py my_recording
          python scripts/start_pipline.py datasets/board_slow --run-emvs -- --stride 2 --start_us 5e6
 
-Stages: preprocess (if the data set needs it), export (track), ply, cleanup, EMVS (on request), view. The folder of
+Stages: preprocess (if the data set needs it), export (track), ply, cleanup, emvs (on request), view. The folder of
 results holds pipeline.json with what each stage did; --resume leaves alone what is unchanged. Everything after -- goes
 to export_pointcloud.py. Exit code 0: all went well; 1: a stage failed; 2: wrong arguments or paths.
 """
@@ -88,9 +88,21 @@ def _add_cleanup(parser: AliasParser) -> None:
 def _add_emvs(parser: AliasParser) -> None:
     emvs = parser.add_argument_group("semi-dense map (EMVS)")
     emvs.add_argument("--run-emvs", action="store_true", help="map along the trajectory, into emvs/")
+    emvs.add_argument("--emvs-backend", choices=("python", "ros"), default="python",
+                      help="the built-in mapper, or rosrun mapper_emvs run_emvs")
     emvs.add_argument("--emvs-min-depth", type=float, help="nearest depth (default: from the cloud)")
     emvs.add_argument("--emvs-max-depth", type=float, help="farthest depth (default: from the cloud)")
     emvs.add_argument("--emvs-dimZ", type=int, default=100, help="depth planes")
+    bag = parser.add_argument_group("hand-over to EMVS in ROS")
+    bag.add_argument("--export-emvs-mono", action="store_true", help="write bag and flag file (needs no ROS)")
+    bag.add_argument("--emvs-bag-name", default="emvs_input.bag", help="name of the bag")
+    bag.add_argument("--emvs-conf-name", default="emvs_mono.conf", help="name of the flag file")
+    bag.add_argument("--emvs-side", choices=("left", "right"), help="camera (default: the tracked one)")
+    bag.add_argument("--emvs-event-topic", default="/dvs/events", help="topic of the events")
+    bag.add_argument("--emvs-camera-info-topic", default="/dvs/camera_info", help="topic of the camera")
+    bag.add_argument("--emvs-pose-topic", default="/pose", help="topic of the poses, camera to world")
+    bag.add_argument("--emvs-t-margin-s", type=float, default=0.5, help="events around the time of the poses [s]")
+    bag.add_argument("--emvs-overwrite", action="store_true", help="replace a bag that no earlier run has written")
 
 
 def split_words(argv: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -128,10 +140,11 @@ def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
         parser.error("expected a folder, as positional argument or as --indir" if not given
                      else f"two folders were given, {args.folder} and {args.indir}; expected one")
     args.folder = args.folder or args.indir
-    for name in ("outname", "frame_out"):
-        if Path(getattr(args, name)).name != getattr(args, name):
-            parser.error(f"--{name} is a file name in the folder of results, found {getattr(args, name)!r}; the folder "
-                         "is chosen with --outdir")
+    for name in ("outname", "frame_out", "emvs_bag_name", "emvs_conf_name"):
+        file = getattr(args, name)
+        if Path(file).name != file:
+            parser.error(f"--{name.replace('_', '-')} is a file name in the folder of results, found {file!r}; the "
+                         "folder is chosen with --outdir")
     if args.display and not args.view:
         parser.error("--display shows the page that --no-view leaves out; give only one of them")
     return args, export_arguments(args, forwarded, parser)
@@ -146,8 +159,12 @@ def pipeline_options(args: argparse.Namespace, export: dict[str, Any], command: 
         outname=args.outname, frame_out=args.frame_out,
         cleanup=CleanupOptions(args.cleanup_algorithm, args.cleanup_output, args.nb_neighbors, args.std_ratio,
                                args.radius, args.min_neighbors),
-        emvs=EmvsStageOptions(run=args.run_emvs, min_depth=args.emvs_min_depth, max_depth=args.emvs_max_depth,
-                              dimZ=args.emvs_dimZ), view=args.view,
+        emvs=EmvsStageOptions(
+            run=args.run_emvs, backend=args.emvs_backend, export_bag=args.export_emvs_mono, side=args.emvs_side,
+            bag_name=args.emvs_bag_name, conf_name=args.emvs_conf_name, event_topic=args.emvs_event_topic,
+            camera_info_topic=args.emvs_camera_info_topic, pose_topic=args.emvs_pose_topic,
+            min_depth=args.emvs_min_depth, max_depth=args.emvs_max_depth, dimZ=args.emvs_dimZ,
+            t_margin_s=args.emvs_t_margin_s, overwrite=args.emvs_overwrite), view=args.view,
         overwrite_preprocessing=args.overwrite_preprocessing, resume=args.resume, dry_run=args.dry_run,
         keep_going=args.keep_going, command=tuple(command))
 

@@ -71,10 +71,17 @@ class StandIn:
 
 
 @pytest.fixture
-def export(monkeypatch: pytest.MonkeyPatch) -> StandIn:
+def tracked(monkeypatch: pytest.MonkeyPatch) -> StandIn:
     stand_in = StandIn()
     monkeypatch.setattr(stages, "export_pointcloud", stand_in)
     return stand_in
+
+
+@pytest.fixture
+def export(tracked: StandIn, monkeypatch: pytest.MonkeyPatch) -> StandIn:
+    """The stand-in, and pictures that take no time."""
+    monkeypatch.setattr("utils.clouds.preview.save_preview", lambda path, *_, **__: Path(path).write_text("picture"))
+    return tracked
 
 
 @pytest.fixture
@@ -120,7 +127,7 @@ def statuses(folder: Path) -> dict[str, str]:
     return {stage["name"]: stage["status"] for stage in record["stages"]}
 
 
-def test_products_and_record(call: Callable, export: StandIn, recording: Path) -> None:
+def test_products_and_record(call: Callable, tracked: StandIn, recording: Path) -> None:
     done = call(recording, "--seed", 3)
     assert done.returncode == 0, done.stderr
     out = Path("results/walk")
@@ -136,11 +143,11 @@ def test_products_and_record(call: Callable, export: StandIn, recording: Path) -
     record = json.loads((out / "pipeline.json").read_text())
     assert record["status"] == "ok" and record["summary"] == done.stdout.splitlines()
     assert record["recognised"]["dataset"] == "generic" and record["command"] == [str(recording), "--seed", "3"]
-    tracked = record["stages"][1]
-    assert tracked["inputs"][str(recording)].startswith("folder:2:") and tracked["settings"]["seed"] == 3
-    assert any(path.endswith("tiny.yaml") for path in tracked["inputs"])
+    stage = record["stages"][1]
+    assert stage["inputs"][str(recording)].startswith("folder:2:") and stage["settings"]["seed"] == 3
+    assert any(path.endswith("tiny.yaml") for path in stage["inputs"])
     assert all(mark != "missing" for stage in record["stages"] for mark in stage["outputs"].values())
-    assert export.calls[0].export_frame_data and export.calls[0].dataset == "generic"
+    assert tracked.calls[0].export_frame_data and tracked.calls[0].dataset == "generic"
 
 
 @pytest.mark.parametrize("form", ["{walk}", "{walk}/", "--indir {walk}", "--indir {walk}/", "{around}", "{relative}/",
@@ -220,11 +227,50 @@ def test_dry_run_touches_nothing(call: Callable, export: StandIn, recording: Pat
     done = call(recording, "--dry-run", "--run-emvs")
     assert done.returncode == 0 and not export.calls and not Path("results").exists()
     assert "1. preprocess: nothing to do" in done.stdout and "2. export: track" in done.stdout
-    assert "emvs.ply" in done.stdout and "pointcloud_view.html" in done.stdout
+    assert "emvs/emvs.ply" in done.stdout and "pointcloud_view.html" in done.stdout
     assert call(recording).returncode == 0
     again = call(recording, "--dry-run", "--resume", "--cleanup-algorithm", "sor").stdout
     assert "2. export: nothing to do, inputs, settings and products are unchanged" in again
     assert "4. cleanup: remove" in again and "5. view: write" in again
+
+
+def test_bag_and_flag_file_for_ros(call: Callable, export: StandIn, recording: Path) -> None:
+    done = call(recording, "--export-emvs-mono", "--emvs-dimZ", 50, "--emvs-min-depth", 1, "--emvs-max-depth", 9,
+                "--emvs-pose-topic", "/optitrack/davis")
+    assert done.returncode == 0, done.stderr
+    flags = dict(line.removeprefix("--").split("=") for line in Path("results/walk/emvs_mono.conf").read_text().split())
+    assert (flags["dimZ"], flags["pose_topic"]) == ("50", "/optitrack/davis")
+    assert (float(flags["min_depth"]), float(flags["max_depth"])) == (1, 9)
+    assert Path(flags["bag_filename"]).is_file() and "emvs_input.bag" in done.stdout
+    assert call(recording, "--export-emvs-mono").returncode == 0  # of an earlier run, so it may be replaced
+
+
+def test_the_bag_of_somebody_else_is_not_replaced(call: Callable, export: StandIn, recording: Path) -> None:
+    bag = Path("out/emvs_input.bag")
+    bag.parent.mkdir()
+    bag.write_text("precious")
+    done = call(recording, "--export-emvs-mono", "--outdir", "out")
+    assert done.returncode == 2 and "--emvs-overwrite" in done.stderr and bag.read_text() == "precious"
+    assert not export.calls
+
+
+def test_mapping_with_ros(call: Callable, export: StandIn, recording: Path, tmp_path: Path,
+                          monkeypatch: pytest.MonkeyPatch) -> None:
+    assert call(recording, "--run-emvs", "--emvs-backend", "ros").returncode == 2  # no rosrun here
+    rosrun = tmp_path / "bin" / "rosrun"
+    rosrun.parent.mkdir()
+    rosrun.write_text('#!/bin/sh\necho "mapping $*"\necho x > depth_points.pcd\nexit ${ROSRUN_CODE:-0}\n')
+    rosrun.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{rosrun.parent}:{os.environ['PATH']}")
+    words = (recording, "--run-emvs", "--emvs-backend", "ros", "--emvs-min-depth", 1, "--emvs-max-depth", 9)
+    done = call(*words)
+    assert done.returncode == 0, done.stderr
+    conf = Path("results/walk/emvs_mono.conf").absolute()
+    assert f"mapping mapper_emvs run_emvs --flagfile={conf}" in done.stderr
+    assert Path("results/walk/emvs/depth_points.pcd").is_file() and statuses(Path("results/walk"))["emvs bag"] == "done"
+    monkeypatch.setenv("ROSRUN_CODE", "3")
+    done = call(*words)
+    assert done.returncode == 1 and "ended with 3: mapping mapper_emvs" in done.stdout
 
 
 def test_edge_clouds_get_files_for_viewers(call: Callable, export: StandIn, recording: Path) -> None:
@@ -277,6 +323,7 @@ WRONG = {
     "pipeline flag for the export": (["{walk}", "--", "--frame-data-out=x.npz"], "use --frame_out"),
     "folder in a name": (["{walk}", "--outname", "a/b.npy"], "--outdir"),
     "unknown kind of cloud": (["{walk}", "--outname", "b.obj"], ".obj"),
+    "too many planes": (["{walk}", "--export-emvs-mono", "--emvs-dimZ", "999"], "2 to 256 planes"),
     "missing weights": (["{walk}", "--weights", "none.pth"], "none.pth"),
     "missing config": (["{walk}", "--config", "none.yaml"], "none.yaml"),
     "bad filter": (["{walk}", "--cleanup-algorithm", "statistical"], "invalid choice"),
