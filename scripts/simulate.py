@@ -35,6 +35,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
     add("--background", action="store_true", help="put a slanted textured plane behind the board")
     add("--threshold", type=float, default=0.22, help="contrast threshold in log intensity")
     add("--noise", choices=("none", "typical", "strong"), default="typical", help="noise of the pixels")
+    add("--textures", default="", metavar="FOLDER", help="images for the surfaces (default: procedural textures)")
     add("--device", default="auto", help="where to render: auto, cpu, cuda or cuda:0")
     add("--overwrite", action="store_true", help="replace an older simulated recording")
     return parser
@@ -53,7 +54,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)  # drawing and pixels run side by side; more threads would only wait for each other
     settings = SequenceSettings(
         scene=args.scene, seconds=args.seconds, seed=args.seed, preset=args.preset, size=parse_size(args.size),
-        distorted=args.distortion, background=args.background, threshold=args.threshold, noise=args.noise)
+        distorted=args.distortion, background=args.background, threshold=args.threshold, noise=args.noise,
+        textures=args.textures)
     options = FolderOptions(args.fps, args.frames, args.depth, args.overwrite, progress=True)
     summary = write_recording(args.out, settings, options, resolve_device(args.device))
     print(f"{summary.folder}: {summary.events} events in {summary.seconds:g} s "

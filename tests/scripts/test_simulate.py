@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from scripts.cli import run_cli
@@ -73,3 +75,29 @@ def test_wrong_command_lines_exit_with_two(arguments: list[str], capsys: pytest.
         main(arguments)
     assert leave.value.code == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_images_of_a_folder_cover_the_surfaces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    (tmp_path / "pictures").mkdir()
+    for name, height, width in (("wide.png", 90, 160), ("tall.jpg", 120, 64)):
+        picture = cv2.resize(rng.integers(0, 255, (9, 16), dtype=np.uint8), (width, height))
+        assert cv2.imwrite(str(tmp_path / "pictures" / name), picture)
+    (tmp_path / "pictures" / "notes.txt").write_text("no image")
+
+    def simulate(*extra: str) -> np.ndarray:
+        out = tmp_path / f"out{len(list(tmp_path.iterdir()))}"
+        assert run_cli(main, ["--scene", "planes", "--out", str(out), "--seconds", "0.1", "--seed", "1", "--size",
+                              "48x36", "--no-depth", "--frames", *extra]) == 0
+        return cv2.imread(str(sorted((out / "images").iterdir())[0]), cv2.IMREAD_GRAYSCALE)
+
+    covered = simulate("--textures", str(tmp_path / "pictures"))
+    np.testing.assert_array_equal(covered, simulate("--textures", str(tmp_path / "pictures")))
+    assert np.abs(covered.astype(int) - simulate().astype(int)).mean() > 5, "the textures made no difference"
+    capsys.readouterr()
+
+    (tmp_path / "pictures" / "tall.jpg").write_bytes(b"damaged")
+    for folder, words in (("pictures", "tall.jpg"), ("nothing", "no images")):
+        assert run_cli(main, ["--scene", "planes", "--out", str(tmp_path / "x"), "--textures",
+                              str(tmp_path / folder)]) == 2
+        assert words in capsys.readouterr().err

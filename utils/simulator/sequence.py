@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -41,6 +42,7 @@ class SequenceSettings:
         threshold: contrast threshold in log intensity.
         noise: one of `NOISE`.
         step_px: largest image motion between two renderings.
+        textures: folder of images that cover the surfaces, as a path in text; empty for procedural textures.
 
     Raises:
         InputError: a value out of range or an unknown name.
@@ -56,6 +58,7 @@ class SequenceSettings:
     threshold: float = 0.22
     noise: str = "typical"
     step_px: float = 0.5
+    textures: str = ""
 
     def __post_init__(self) -> None:
         for what, name, known in (("scene", self.scene, WORLDS), ("preset", self.preset, PRESETS),
@@ -91,7 +94,8 @@ class SimulatedSequence:
     def __init__(self, settings: SequenceSettings, device: torch.device | str = "cpu") -> None:
         self.settings = settings
         self.camera: Calibration = camera_preset(*settings.size, settings.distorted)
-        self.world: World = build_world(settings.scene, self.camera.fx, settings.seed, settings.background)
+        self.world: World = build_world(settings.scene, self.camera.fx, settings.seed, settings.background,
+                                        Path(settings.textures) if settings.textures else None)
         self.duration_us = round(settings.seconds * 1e6)
         rays = camera_rays(self.camera)
         path_rng = np.random.default_rng([settings.seed, 2])

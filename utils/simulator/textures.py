@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+
+from devo.errors import InputError
 
 FloatImage = np.ndarray
 Canvas = np.ndarray
 LOG_FLOOR = 0.04
 """Reflectance added before the logarithm, so that black paper is black and not minus infinity."""
 
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_COMPLEX)
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ0123456789#&%@?+=*"
 _SHIFT = 4  # cv2 draws with 1/16 pixel coordinates, which together with LINE_AA keeps edges smooth
@@ -230,6 +234,39 @@ def random_texture(size: int, rng: np.random.Generator, kind: str | None = None)
         image = image + rng.uniform(0.02, 0.25) * (value_noise(size, rng, coarsest=16, octaves=4) - 0.5)
     shade = 1.0 - rng.uniform(0, 0.5) * value_noise(size, rng, coarsest=1, octaves=2)
     return np.clip(image * shade, 0.0, 1.0).astype(np.float32)
+
+
+def image_textures(folder: Path, count: int, size: int, rng: np.random.Generator) -> list[FloatImage]:
+    """Reflectance maps `(size, size)` float32 in 0..1 cut at random out of the images of a folder.
+
+    Images are taken in random order, each once before any is taken again; grey values count as reflectance.
+
+    Args:
+        folder: images that OpenCV reads; other files are passed over by their ending.
+        count: number of maps.
+        size: texels per side.
+        rng: decides order and crops.
+
+    Raises:
+        InputError: no image in the folder, or one that cannot be read.
+    """
+    files = folder.iterdir() if folder.is_dir() else ()
+    paths = sorted(path for path in files if path.suffix.lower() in _IMAGE_SUFFIXES)
+    if not paths:
+        raise InputError(f"{folder}: no images for textures, expected a folder with {', '.join(_IMAGE_SUFFIXES)}")
+    order = np.concatenate([rng.permutation(len(paths)) for _ in range(-(-count // len(paths)))])[:count]
+    return [_square_crop(paths[index], size, rng) for index in order]
+
+
+def _square_crop(path: Path, size: int, rng: np.random.Generator) -> FloatImage:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InputError(f"cannot read texture {path}: the file is damaged or no image")
+    side = int(min(image.shape) * rng.uniform(0.6, 1.0))
+    top, left = (int(rng.integers(0, length - side + 1)) for length in image.shape)
+    crop = image[top : top + side, left : left + side]
+    method = cv2.INTER_AREA if side > size else cv2.INTER_CUBIC
+    return np.clip(cv2.resize(crop, (size, size), interpolation=method).astype(np.float32) / 255.0, 0.0, 1.0)
 
 
 def log_reflectance(image: FloatImage) -> FloatImage:

@@ -53,10 +53,10 @@ class ClipSettings:
         normalise: scale every clip so that 0.7 times the 98 % quantile of its inverse depths is 1.
     """
 
-    scenes: tuple[tuple[str, float], ...] = (("planes", 0.35), ("room", 0.25), ("board", 0.2), ("corridor", 0.2))
+    scenes: tuple[tuple[str, float], ...] = (("planes", 0.3), ("room", 0.3), ("board", 0.15), ("corridor", 0.25))
     motions: tuple[tuple[str, float], ...] = (("translate", 0.4), ("orbit", 0.15), ("rotate", 0.15), ("forward", 0.15),
                                               ("shake", 0.15))
-    mean_flow_px: Range = (1.0, 12.0)
+    mean_flow_px: Range = (1.0, 20.0)
     focal: Range = (0.55, 1.3)
     frame_ms: Range = (8.0, 60.0)
     threshold: Range = (0.16, 0.34)

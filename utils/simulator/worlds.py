@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +16,14 @@ import torch
 
 from utils.simulator.layouts import PlaneList, tilted
 from utils.simulator.scenes import Planes
-from utils.simulator.textures import SYMBOLS, draw_symbol, log_reflectance, random_texture, value_noise
+from utils.simulator.textures import (
+    SYMBOLS,
+    draw_symbol,
+    image_textures,
+    log_reflectance,
+    random_texture,
+    value_noise,
+)
 
 BOARD_TILE = 2048
 SURFACE_TILE = 512
@@ -46,7 +54,7 @@ class World:
     empty: float = float(np.log(EMPTY_GREY))
 
 
-def build_world(kind: str, focal: float, seed: int, background: bool = False) -> World:
+def build_world(kind: str, focal: float, seed: int, background: bool = False, textures: Path | None = None) -> World:
     """Build a world; the same arguments, the same world.
 
     Args:
@@ -54,27 +62,39 @@ def build_world(kind: str, focal: float, seed: int, background: bool = False) ->
         focal: focal length in pixels; textures get a detail that suits it.
         seed: decides geometry, textures and way points.
         background: put a slanted textured plane behind the board (other scenes are closed anyway).
+        textures: folder of images that cover the surfaces instead of procedural textures; the board shows one of them.
+
+    Raises:
+        InputError: a folder of textures without usable images (when the tiles are drawn).
     """
     rng = np.random.default_rng([seed, list(WORLDS).index(kind)])
     if kind == "board":
-        return _board_world(focal, seed, rng, background)
+        return _board_world(focal, seed, rng, background, textures)
     collected = PlaneList(focal, SURFACE_TILE, rng, sharpness=(0.2, 0.5))
     way_points = WORLDS[kind](collected)
     tile_seed = [seed, list(WORLDS).index(kind), 1]
     return World(kind, collected.planes(), collected.names,
-                 lambda: _surfaces(len(collected.names), tile_seed), way_points)
+                 lambda: _surfaces(len(collected.names), tile_seed, textures), way_points)
 
 
-def _surfaces(count: int, seed: list[int]) -> torch.Tensor:
+def _surfaces(count: int, seed: list[int], textures: Path | None) -> torch.Tensor:
     """Tiles `(count, T, T)` of at most `UNIQUE_SURFACES` patterns, each piece with its own contrast and brightness."""
     rng = np.random.default_rng(seed)
-    patterns = [log_reflectance(random_texture(SURFACE_TILE, rng)) for _ in range(min(count, UNIQUE_SURFACES))]
+    patterns = [log_reflectance(image) for image in _paint(min(count, UNIQUE_SURFACES), SURFACE_TILE, rng, textures)]
     picks = np.concatenate([rng.permutation(len(patterns)) for _ in range(-(-count // len(patterns)))])[:count]
     tiles = [patterns[pick] * rng.uniform(0.5, 1.0) + rng.normal(0, 0.2) for pick in picks]
     return torch.from_numpy(np.stack(tiles).astype(np.float32))
 
 
-def _board_world(focal: float, seed: int, rng: np.random.Generator, background: bool) -> World:
+def _paint(count: int, size: int, rng: np.random.Generator, textures: Path | None) -> list[np.ndarray]:
+    if textures is not None:
+        return image_textures(textures, count, size, rng)
+    return [random_texture(size, rng) for _ in range(count)]
+
+
+def _board_world(
+    focal: float, seed: int, rng: np.random.Generator, background: bool, textures: Path | None
+) -> World:
     collected = PlaneList(focal, BOARD_TILE, rng, sharpness=(0.05, 0.12))
     distance, half_width, half_height = 0.9, 0.8, 0.6
     collected.add(np.array([0, 0, distance]), tilted(rng, 12), half_width, half_height, spin=_upright(rng),
@@ -84,9 +104,9 @@ def _board_world(focal: float, seed: int, rng: np.random.Generator, background: 
 
     def draw_tiles() -> torch.Tensor:
         painter = np.random.default_rng([seed, 1])
-        board = log_reflectance(printed_board(BOARD_TILE, half_height / half_width, painter))
-        wall = [log_reflectance(random_texture(BOARD_TILE, painter))] if background else []
-        return torch.from_numpy(np.stack([board, *wall]))
+        images = [] if textures else [printed_board(BOARD_TILE, half_height / half_width, painter)]
+        images += _paint(1 + background - len(images), BOARD_TILE, painter, textures)
+        return torch.from_numpy(np.stack([log_reflectance(image) for image in images]))
 
     way_points = _wander((0.30, 0.22, 0.22), (0, 0, distance), (0.3, 0.2, 0.0))
     return World("board", collected.planes(), collected.names, draw_tiles, way_points)

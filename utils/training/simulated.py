@@ -17,15 +17,19 @@ from utils.training.settings import TrainSettings
 VALIDATION_FRAMES = 10
 VALIDATION_SIZE = (128, 160)
 VALIDATION_SEED = 2**31 - 7
-SIMULATOR_VERSION = 1  # part of the cache key: raise it when the simulator changes its output
+SIMULATOR_VERSION = 2  # part of the cache key: raise it when the simulator changes its output
+SHARDS_PER_BANK = 16  # new textures after so many shards; painting them costs as much as one shard
+BANK_SIZE = 48
 
 
 def simulate_shard(settings: ShardSettings, number: int) -> TrainingClips:
     """Simulate one shard; the same (settings, number) gives the same clips."""
-    from utils.simulator.training import sample_clips
+    from utils.simulator.training import ClipSettings, sample_clips
 
     generator = generator_for(settings.seed, 2, number)
-    clips = sample_clips(settings.clips, settings.frames, settings.height, settings.width, generator=generator)
+    bank_seed = generator_for(settings.seed, 4, number // SHARDS_PER_BANK).initial_seed() % 2**31
+    clips = sample_clips(settings.clips, settings.frames, settings.height, settings.width, generator=generator,
+                         settings=ClipSettings(bank_size=BANK_SIZE, bank_seed=bank_seed))
     return TrainingClips(clips.voxels, clips.world_T_cam, clips.inv_depths, clips.intrinsics).to("cpu").check()
 
 
