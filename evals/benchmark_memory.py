@@ -7,6 +7,8 @@ cloud being recorded. The network is untrained and small: memory over time does 
 `--keyframes few` every keyframe is removed again as soon as possible, so growth beyond keyframes shows; with
 `--keyframes all` none is removed.
 
+Ctrl-C ends the recording early; the figures are then those of the frames until there.
+
 Example: python evals/benchmark_memory.py --frames 2000 --size 640x480
 """
 
@@ -93,7 +95,8 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     # scale 0 lets every frame count as moving before initialisation, whatever the untrained network says
     result = track(frames if edges is None else edges.tap(frames), cfg, network, height=height, width=width, scale=0.0,
                    colors=True, frame_mode="final", accumulate_map=True, total=sequence.expected_length,
-                   progress=True, on_frame=on_frame, on_end=recorder.on_end)
+                   progress=True, keep_on_interrupt=True, on_frame=on_frame, on_end=recorder.on_end)
+    frames.close()
     count, memory, keyframes = np.array(samples).T
     late = count > WARM_UP * count[-1]
     slope = float(np.polyfit(count[late], memory[late], 1)[0]) * 100
@@ -110,7 +113,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--frames", type=int, default=2000)
     add("--size", default="640x480", help="WIDTHxHEIGHT")
-    add("--events", type=int, default=40_000, help="events per frame")
+    add("--events", type=int, default=24_000, help="events per frame")
     add("--keyframes", choices=("few", "all"), default="few")
     add("--patches", type=int, default=16, help="patches per frame")
     add("--edge_topk", type=int, default=0, help="also record the edge cloud with so many pixels per frame")

@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from devo.errors import InputError
 from devo.poses import invert_poses_numpy, normalize_poses_numpy
 from utils.array_files import save_arrays
 from utils.clouds.arrays import load_arrays
@@ -129,7 +130,10 @@ def read_frame_bundle(path: str | PathLike[str]) -> FrameBundle:
     filled = np.arange(arrays["centers"].shape[1]) < counts[:, None]
     if not np.array_equal(arrays["offsets"], offsets[:-1]) or len(arrays["depths"]) != total or filled.sum() != total:
         reject(path, f"counts say {total} patches, found {len(arrays['depths'])} depths and other offsets or centers")
-    poses = normalize_poses_numpy(arrays["poses"])
+    try:
+        poses = normalize_poses_numpy(arrays["poses"])
+    except InputError as error:
+        reject(path, str(error))
     if str(arrays.get("pose_convention", "T_cam_world")) == "T_world_cam":
         poses = invert_poses_numpy(poses)
     return FrameBundle(
