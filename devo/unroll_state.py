@@ -64,7 +64,7 @@ class JoinedClips:
     def __init__(
         self, network: eVONet, images: Tensor, poses: SE3, disps: Tensor, intrinsics: Tensor, settings: UnrollSettings
     ) -> None:
-        from devo.corr_volume import CorrelationVolume
+        from devo.altcorr import CorrBlock
         from devo.lietorch import SE3
 
         self.clips, self.frames = images.shape[:2]
@@ -82,8 +82,8 @@ class JoinedClips:
         self.patches_gt = patches.detach().float()
         self.patches = self._with_depth(self._start_depth())
         fmap = fmap.float().reshape(1, flat, *fmap.shape[2:])
-        self.correlate = CorrelationVolume(
-            fmap, gmap.float(), self.clips, dtype=settings.mixed_precision or torch.float32
+        self.correlate = CorrBlock(
+            fmap, gmap.float(), clips=self.clips, compute_dtype=settings.mixed_precision or torch.float32
         )
         self.context = imap.reshape(flat * self.per_frame, -1)
         self.intrinsics = (intrinsics / network.RES).reshape(1, flat, 4)

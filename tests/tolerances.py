@@ -66,5 +66,4 @@ EMVS_VOTES_NEAR_PLANES = 2e-4  # the same with cameras among the planes; 5.2e-5 
 EMVS_PIXELS = 5e-5  # event -> plane -> event; 1.5e-5
 
 # --- training -----------------------------------------------------------------------------------------------
-CORRELATION_VOLUME = 1e-4  # volume against direct correlation, values up to 40 and gradients; observed 1e-5
 JOINED_CLIPS = 1e-3  # joined against single clips after 4 updates, pixels and poses; observed below 1e-4

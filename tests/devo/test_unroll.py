@@ -7,15 +7,14 @@ import torch
 from torch import Tensor, nn
 
 from devo import projective_ops as pops
-from devo.altcorr import corr, patchify
-from devo.corr_volume import CorrelationVolume
+from devo.altcorr import patchify
 from devo.enet import eVONet
 from devo.errors import InputError
 from devo.lietorch import SE3
 from devo.losses import direct_loss, flow_loss, pose_loss
 from devo.unroll import UnrollResult, unroll, unroll_clips
 from devo.unroll_state import UnrollSettings
-from tests.tolerances import CORRELATION_VOLUME, JOINED_CLIPS
+from tests.tolerances import JOINED_CLIPS
 
 PATCHES = 6
 
@@ -181,44 +180,6 @@ def test_start_between_identity_and_truth() -> None:
     edges[own, :, own] = False
     assert errors[2].median() < errors[0].median()  # depth is wrong everywhere, poses only in the first
     assert result.poses_gt.shape == (3, 4)
-
-
-def test_volume_equals_direct_correlation_with_gradients() -> None:
-    generator = torch.Generator().manual_seed(0)
-    clips, frames, patches, channels, height, width = 2, 3, 4, 8, 11, 14
-    fmap = torch.randn(1, clips * frames, channels, height, width, generator=generator, requires_grad=True)
-    gmap = torch.randn(1, clips * frames * patches, channels, 3, 3, generator=generator, requires_grad=True)
-    kk = torch.arange(clips * frames * patches).repeat_interleave(frames)
-    jj = kk // (frames * patches) * frames + torch.arange(frames).repeat(clips * frames * patches)
-    centre = torch.rand(1, len(kk), 2, 1, 1, generator=generator) * 30 - 9
-    coords = centre + torch.randn(1, len(kk), 2, 3, 3, generator=generator)
-    coords[0, 0], coords[0, 1] = 1e7, -1e7
-    weight = torch.randn(1, len(kk), 882, generator=generator)
-    volume = CorrelationVolume(fmap, gmap, clips, keep=1.0)
-    ours = volume(kk, jj, coords)
-    pooled = torch.nn.functional.avg_pool2d(fmap[0], 4, 4)[None]
-    levels = [corr(gmap, maps, coords / scale, kk, jj, 3) for maps, scale in ((fmap, 1), (pooled, 4))]
-    direct = torch.stack(levels, -1).reshape(1, len(kk), 882)
-    torch.testing.assert_close(ours, direct, rtol=1e-5, atol=CORRELATION_VOLUME)
-    second = volume(kk, jj, coords + 1.3)  # two lookups share one gradient buffer
-    gradients = torch.autograd.grad(((ours + second) * weight).sum(), (fmap, gmap))
-    shifted = [corr(gmap, maps, (coords + 1.3) / scale, kk, jj, 3) for maps, scale in ((fmap, 1), (pooled, 4))]
-    expected = torch.autograd.grad(
-        ((direct + torch.stack(shifted, -1).reshape(1, len(kk), 882)) * weight).sum(), (fmap, gmap)
-    )
-    for ours_part, expected_part in zip(gradients, expected):
-        torch.testing.assert_close(ours_part, expected_part, rtol=1e-5, atol=CORRELATION_VOLUME)
-
-
-def test_volume_keeps_the_asked_share_of_pairs_in_the_backward_pass() -> None:
-    fmap = torch.randn(1, 4, 8, 12, 12, requires_grad=True)
-    gmap = torch.randn(1, 40, 8, 3, 3, requires_grad=True)
-    kk, jj = torch.arange(40).repeat_interleave(4), torch.arange(4).repeat(40)
-    coords = torch.full((1, 160, 2, 3, 3), 5.0)
-    volume = CorrelationVolume(fmap, gmap, 1, keep=0.2)
-    (gradient,) = torch.autograd.grad(volume(kk, jj, coords).sum(), gmap)
-    assert volume.pairs.shape == (4, 8)
-    assert set(gradient[0].flatten(1).abs().sum(1).nonzero()[:, 0].tolist()) == set(volume.pairs.flatten().tolist())
 
 
 def test_every_parameter_gets_a_finite_gradient() -> None:
