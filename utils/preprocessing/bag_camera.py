@@ -135,15 +135,19 @@ class BagCamera:
             return (int(message.width), int(message.height)), (K[0], K[4], K[2], K[5])
         raise InputError(f"{self.path}: topic {topic} holds no camera info")
 
-    def first_event_ns(self, topic: str) -> int:
-        """Return the stamp of the first event.
+    def first_event_ns(self, topic: str, order: Order) -> int:
+        """Return the stamp of the first event; "sort" looks through all events for the earliest.
 
         Raises:
             InputError: there are no events.
         """
-        for t_ns in (message.t_ns for message in self._event_messages(topic) if len(message.t_ns)):
-            return int(t_ns[0])
-        raise InputError(f"{self.path}: topic {topic} holds no events")
+        stamps = (message.t_ns for message in self._event_messages(topic) if len(message.t_ns))
+        first = next(stamps, None)
+        if first is None:
+            raise InputError(f"{self.path}: topic {topic} holds no events")
+        if order == "error":
+            return int(first[0])
+        return min(int(first.min()), *(int(t_ns.min()) for t_ns in stamps), int(first[0]))
 
     def event_blocks(self, topic: str, zero_ns: int, sensor_size: tuple[int, int],
                      order: Order) -> Iterator[EventBlock]:

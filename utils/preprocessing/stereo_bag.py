@@ -111,7 +111,7 @@ def _write_clocked(bag: BagCamera, topics: Topics, calibration: Calibration, rec
     if not products.missing(*needed):
         return
     stamps_ns = bag.image_stamps_ns(topics.images)
-    first_ns = [bag.first_event_ns(topics.events), int(stamps_ns.min())]
+    first_ns = [bag.first_event_ns(topics.events, products.options.on_unsorted), int(stamps_ns.min())]
     if poses is not None:
         first_ns.append(int(poses.t_us[0]))
     zero_ns = min(first_ns)

@@ -15,6 +15,8 @@ from utils.simulator.sequence import SequenceSettings, SimulatedSequence
 
 SECONDS = 0.45
 IMAGE_INTERVAL_US = 33_000
+EPOCH_US = 1_600_000_000_000_000
+"""Where a clock of Unix microseconds stands."""
 _SMALL = (120, 90)
 _SCALE = 2
 
@@ -68,6 +70,20 @@ def simulated() -> RawRecording:
     return RawRecording((_SMALL[0] * _SCALE, _SMALL[1] * _SCALE), events, stamps_us,
                         [np.kron(image, np.ones((_SCALE, _SCALE), np.uint8)) for image in small], poses_us,
                         sequence.path.poses(poses_us).numpy())
+
+
+def random_recording(size: tuple[int, int] = (240, 180), start_us: int = EPOCH_US,
+                     count: int = 900) -> RawRecording:
+    """A small recording of random events with four images and six poses, all on a clock of Unix microseconds."""
+    rng = np.random.default_rng(2)
+    t_us = start_us + 2000 + np.sort(rng.integers(0, 120_000, count))
+    x, y, p = (rng.integers(0, limit, count) for limit in (*size, 2))
+    events = Events(x.astype(np.uint16), y.astype(np.uint16), t_us, p.astype(np.uint8))
+    images = [rng.integers(0, 256, (size[1], size[0])).astype(np.uint8) for _ in range(4)]
+    turn = rng.normal(size=(6, 4))
+    poses = np.hstack([rng.normal(size=(6, 3)), turn / np.linalg.norm(turn, axis=1, keepdims=True)])
+    return RawRecording(size, events, start_us + 5000 + 30_000 * np.arange(4), images,
+                        start_us + 1000 + 20_000 * np.arange(6), poses)
 
 
 def write_generic(folder: Path, recording: RawRecording, calibration: Calibration) -> Path:
