@@ -20,7 +20,7 @@ from utils.datasets.recognise import LAYOUTS, recognise
 from utils.datasets.registry import SequenceOptions, open_sequence
 from utils.events import Events
 from utils.pipeline import stages
-from utils.preprocessing import PREPROCESSORS
+from utils.preprocessing import PREPROCESSORS, find_sequences
 
 START_US = 50_000_000
 
@@ -78,6 +78,9 @@ def test_raw_files_to_sequence(dataset: str, tmp_path: Path, monkeypatch: pytest
     root = tmp_path / "raw"
     root.mkdir()
     case.write(root)
+    # the command that is named to users finds just this sequence
+    assert find_sequences(dataset, recognise(root / case.given, case.side).source, case.side)[1] == [
+        root / case.sequence]
     command = [str(root / case.given), "--side", case.side, "--outdir", "out"]
     assert main(command) == 0
     asked = export.calls[0]
