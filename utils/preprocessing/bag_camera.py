@@ -173,13 +173,15 @@ class BagCamera:
 
     def _event_columns(self, topic: str, order: Order) -> Iterator[tuple[Any, ...]]:
         parts: list[Any] = []
+        held = 0
         limit = _EVENTS_PER_BLOCK if order == "error" else float("inf")
         for message in self._event_messages(topic):
             parts.append(message)
-            if sum(len(part.x) for part in parts) >= limit:
+            held += len(message.x)
+            if held >= limit:
                 yield _joined(parts)
-                parts = []
-        if any(len(part.x) for part in parts):
+                parts, held = [], 0
+        if held:
             columns = _joined(parts)
             if order == "sort":
                 rows = np.argsort(columns[2], kind="stable")
