@@ -141,8 +141,23 @@ def surface_points(depth: DepthMaps, track: PoseTrack, number: int, most: int = 
     return np.asarray(seen @ world_T_cam[:3, :3].T + world_T_cam[:3, 3], np.float64)
 
 
-def depth_errors(points: FloatArray, t_us: npt.ArrayLike, depth: DepthMaps, track: PoseTrack) -> DepthErrors:
-    """Errors of points against the true depth map nearest in time to the view that each point comes from.
+@dataclass(frozen=True, eq=False)
+class DepthJudgement:
+    """Points against the true depth map nearest in time to the view that each point comes from.
+
+    Attributes:
+        errors: `(N,)` signed relative depth errors, NaN where the depth map cannot judge.
+        corrected: `(M, 3)` the judged points, moved along their rays to the true depth.
+        summary: figures of the errors.
+    """
+
+    errors: FloatArray
+    corrected: FloatArray
+    summary: DepthErrors
+
+
+def judge_depth(points: FloatArray, t_us: npt.ArrayLike, depth: DepthMaps, track: PoseTrack) -> DepthJudgement:
+    """Compare points with true depth.
 
     Args:
         points: `(N, 3)` metres in the frame of the ground truth.
@@ -153,12 +168,15 @@ def depth_errors(points: FloatArray, t_us: npt.ArrayLike, depth: DepthMaps, trac
     stamps = np.broadcast_to(np.asarray(t_us, np.float64), (len(points),))
     numbers = np.array([depth.nearest(stamp) for stamp in np.unique(stamps)], np.int64)
     per_point = numbers[np.searchsorted(np.unique(stamps), stamps)]
-    errors = np.full(len(points), np.nan)
+    errors, centers = np.full(len(points), np.nan), np.zeros((len(points), 3))
     for number in np.unique(per_point):  # one depth map after the other
         mine = per_point == number
         world_T_cam = track(_inside(track, depth.t_us[number]))[0]
         errors[mine] = relative_depth_errors(points[mine], world_T_cam, depth.intrinsics, depth.load(int(number)))
-    return summarise_depth_errors(errors)
+        centers[mine] = world_T_cam[:3, 3]
+    known = np.isfinite(errors)
+    corrected = centers[known] + (points[known] - centers[known]) / (1 + errors[known, None])
+    return DepthJudgement(errors, corrected, summarise_depth_errors(errors))
 
 
 def _inside(track: PoseTrack, t_us: float) -> float:

@@ -9,12 +9,12 @@ import numpy as np
 
 from devo.errors import TrackingError
 from evals.image_metrics import DepthErrors, EdgeAgreement, Projection, edge_agreement, project
-from evals.pointcloud_metrics import PlaneFit
+from evals.pointcloud_metrics import PlaneFit, nearest_distances
 from evals.validation.agreement import (
     Agreement,
     Planarity,
     compare,
-    depth_errors,
+    judge_depth,
     planarity,
     plane_distances,
     true_plane,
@@ -54,6 +54,8 @@ class TrialSummary:
         units_per_m, ate_rmse_m: scale and error of the trajectory.
         raw_points, points: of the exported cloud, before and after cleaning.
         emvs_to_devo, devo_to_emvs: shares within the judged threshold, in both directions.
+        reachable: what `devo_to_emvs` would be if every point had its true depth: less than 1, because the map
+            holds edges only and covers one view; NaN without true depth.
         chamfer_m: mean distance from the map to the exported cloud.
         plane_rmse_m: of the exported cloud.
         depth_error: median relative depth error of the exported cloud; NaN without true depth.
@@ -69,6 +71,7 @@ class TrialSummary:
     points: float = float("nan")
     emvs_to_devo: float = float("nan")
     devo_to_emvs: float = float("nan")
+    reachable: float = float("nan")
     chamfer_m: float = float("nan")
     plane_rmse_m: float = float("nan")
     depth_error: float = float("nan")
@@ -184,10 +187,9 @@ def validate(settings: ValidationSettings) -> Validation:
     plane = planes[EMVS_TRUE].robust if source.depth is None else true_plane(
         source.depth, track, setup.reference_us, 0.01 * distance)
     depth = {} if source.depth is None else {
-        EMVS_TRUE: depth_errors(points[EMVS_TRUE], setup.reference_us, source.depth, track),
-        EMVS_DEVO: depth_errors(points[EMVS_DEVO], setup.reference_us, source.depth, track),
-        CLEANED: depth_errors(points[CLEANED], cloud.scalars["t_us"], source.depth, track),
-        RAW: depth_errors(points[RAW], raw.scalars["t_us"], source.depth, track)}
+        name: judge_depth(points[name], t_us, source.depth, track).summary for name, t_us in (
+            (EMVS_TRUE, setup.reference_us), (EMVS_DEVO, setup.reference_us), (CLEANED, cloud.scalars["t_us"]),
+            (RAW, raw.scalars["t_us"]))}
     clock.stop("comparisons")
     summaries = [_summarise(other, source, points[EMVS_TRUE], distance, track) for other in trials]
     clock.stop("other trials")
@@ -218,12 +220,16 @@ def _summarise(trial: Trial, source: Source, reference: FloatArray, distance_m: 
     points = alignment.metric_T_devo.apply(cloud.points)
     found = compare("trial", reference, points, [JUDGED_SHARE * distance_m], JUDGED_SHARE * distance_m)
     score = found.scores["before ICP"][0]
-    depth = float("nan") if source.depth is None else depth_errors(points, cloud.scalars["t_us"], source.depth,
-                                                                   track).median
+    error = reachable = float("nan")
+    if source.depth is not None:
+        judged = judge_depth(points, cloud.scalars["t_us"], source.depth, track)
+        error = judged.summary.median
+        if len(judged.corrected):
+            reachable = float((nearest_distances(judged.corrected, reference) < JUDGED_SHARE * distance_m).mean())
     return TrialSummary(
         trial.seed, True, alignment.units_per_m, alignment.ate_rmse_m, len(trial.raw), len(points), score.precision,
-        score.recall, found.chamfer["before ICP"].source_to_target, planarity("trial", points, distance_m).
-        least_squares.rmse, depth, seconds, trial.reused)
+        score.recall, reachable, found.chamfer["before ICP"].source_to_target,
+        planarity("trial", points, distance_m).least_squares.rmse, error, seconds, trial.reused)
 
 
 def _project(name: str, points: FloatArray, picture: Picture, alignment: Alignment, trial: Trial,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = {EMVS_TRUE: "#0072B2", EMVS_DEVO: "#D55E00", CLEANED: "#009E73", RAW: "#999999"}
-_GREY = "#555555"
+_GREY, _CONTROL = "#555555", "#8f8f8f"
 _STYLE: Any = {
     "font.size": 10, "axes.edgecolor": _GREY, "axes.titlesize": 11, "axes.titleweight": "bold",
     "axes.titlelocation": "left",
@@ -188,7 +188,7 @@ def draw_scale_isolation(found: Validation) -> Figure:
     results = list(found.maps.values())
     place = np.arange(len(results))
     colors = [COLORS[EMVS_DEVO] if "devo" in result.variant.key and result.variant.isolates == "scale"
-              else COLORS[EMVS_TRUE] if result.variant.isolates == "scale" else "#8f8f8f" for result in results]
+              else COLORS[EMVS_TRUE] if result.variant.isolates == "scale" else _CONTROL for result in results]
     counts = np.array([len(result.points) for result in results])
     sharp = np.array([result.sharpness for result in results]) / found.maps["gt"].sharpness
     for axes, values, text, title in ((left, counts, "{:.0f}", "points of the map"),
@@ -202,15 +202,19 @@ def draw_scale_isolation(found: Validation) -> Figure:
     labels = [f"{result.variant.label}\n({result.poses_in_span} poses)" for result in results]
     left.set_yticks(place, labels, fontsize=9)
     left.invert_yaxis()
-    for y, text, side in ((3.44, "scale isolation", "bottom"), (3.56, "controls: density, position, rotation", "top")):
-        left.text(left.get_xlim()[1], y, text, ha="right", va=side, color=_GREY, fontsize=8.5)
+    from matplotlib.patches import Patch
+
+    names = ("true poses", "DEVO poses", "controls: density, positions, rotations")
+    shown = [Patch(color=color, label=name) for color, name in zip(
+        (COLORS[EMVS_TRUE], COLORS[EMVS_DEVO], _CONTROL), names)]
+    figure.legend(handles=shown, loc="outside lower center", ncols=3)
     return figure
 
 
 @_styled
 def draw_distances(found: Validation) -> Figure:
     """Histograms of nearest-neighbour distances, and precision and recall over the threshold."""
-    figure, axes = _new(15, 8.2, 2, 2)
+    figure, axes = _new(15, 9.0, 2, 2)
     top = 1000 * float(max(2.2 * found.judged_m, 0.1))
     bins = np.linspace(0, top, 61)
     for column, first in enumerate((EMVS_DEVO, EMVS_TRUE)):
@@ -228,6 +232,7 @@ def draw_distances(found: Validation) -> Figure:
         for one in (panel, curve):
             one.axvline(1000 * found.judged_m, color=_GREY, linewidth=0.9, linestyle="--")
             one.set_xlim(0, top)
+        panel.set_ylim(top=1.25 * panel.get_ylim()[1])
         panel.legend(loc="upper right", fontsize=9)
     return figure
 
@@ -251,7 +256,7 @@ def _curves(axes: Axes, found: Validation, first: str) -> None:
     axes.set_ylim(0, 103)
     axes.set_xlabel("threshold [mm]; dashed: 5 % of the distance of the scene")
     axes.set_ylabel("share within the threshold [%]")
-    axes.legend(loc="lower right", fontsize=8.5, ncols=3)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), fontsize=9, ncols=3)
 
 
 @_styled

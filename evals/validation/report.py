@@ -6,13 +6,12 @@ import base64
 import dataclasses
 import html
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
 from tqdm import tqdm
 
-from devo.errors import OutputError
 from evals.validation import paper
 from evals.validation.experiment import Validation, pair_name
 from evals.validation.figures import all_figures
@@ -163,16 +162,19 @@ def _plain(value: Any) -> Any:
 
 
 def _write_figure(path: Path, figure: Any) -> Path:
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130, metadata={"Software": None})
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        save_figure(figure, file)
     return path
+
+
+def save_figure(figure: Any, file: BinaryIO) -> None:
+    """Write a figure as PNG; the same figure gives the same bytes."""
+    figure.savefig(file, format="png", dpi=130, metadata={"Software": None})
 
 
 def _write_text(path: Path, text: str) -> Path:
     with atomic_path(path) as temporary:
         temporary.write_text(text, "utf-8")
-    if not path.is_file():
-        raise OutputError(f"{path} vanished while it was written")
     return path
 
 
