@@ -30,7 +30,7 @@ def build_arg_parser(datapath_required: bool = True) -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="seed of patch selection and initial depths")
     add("--rgb", action="store_true", help="use the image frames instead of the events (needs frame weights)")
     add("--workers", type=int, default=1,
-        help="threads that decode and voxelise ahead of the tracker, 0 = none; same result")
+        help="0: decode and voxelise between two frames; N: in a thread, up to 4 N frames in advance; same result")
     add_recording_options(parser, required=datapath_required)
 
     extra = parser.add_argument_group("further products")
@@ -47,6 +47,8 @@ def build_arg_parser(datapath_required: bool = True) -> argparse.ArgumentParser:
     extra.add_argument("--frame_data_out", help="file of that bundle; the table goes beside it")
     extra.add_argument("--frame_mode", choices=("final", "online"), default="final",
                        help="per-frame structure from the final state, or as it was right after each frame")
+    extra.add_argument("--save_observations", action="store_true",
+                       help="write where points were measured as _observations.npz (for export_colmap.py)")
     extra.add_argument("--save_dpviewer_cloud", action="store_true", help="write the accumulated map as _dpviewer.npy")
 
     edges = parser.add_argument_group("edge cloud: edges of the events with depths of the patches around them")

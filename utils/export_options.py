@@ -61,6 +61,7 @@ class ExportOptions:
     frame_data_out: str | None = None
     frame_mode: str = "final"
     save_dpviewer_cloud: bool = False
+    save_observations: bool = False
     export_edge_cloud: bool = False
     edge_cloud_out: str | None = None
     edge_downsample: int = 4

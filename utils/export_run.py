@@ -20,6 +20,7 @@ from devo.errors import InputError, TrackingError
 from devo.result import TrackingResult
 from utils.array_files import save_arrays
 from utils.clouds.cloud import PointCloud
+from utils.colmap.observations import Observations, observations_of, save_observations
 from utils.datasets.prefetch import LOOK_AHEAD, prefetch
 from utils.datasets.recognise import AUTO
 from utils.datasets.registry import Recording, locate_sequence, open_sequence
@@ -141,7 +142,7 @@ def _recognised(options: ExportOptions) -> ExportOptions:
 def _stream(sequence: Recording, options: ExportOptions) -> Iterator[Iterable[Frame]]:
     """The frames of the recording, made in advance by a thread that ends with the block."""
     frames = sequence.frames() if options.rgb else sequence.voxels()
-    with contextlib.closing(prefetch(frames, LOOK_AHEAD if options.workers else 0)) as ahead:
+    with contextlib.closing(prefetch(frames, LOOK_AHEAD * options.workers)) as ahead:
         yield ahead
 
 
@@ -154,6 +155,7 @@ class _Recorders:
         dpviewer = products.path("_dpviewer.npy") if options.save_dpviewer_cloud else None
         self.map = MapRecorder(folder, options.voxel_size, dpviewer, keep=options.per_frame_keep)
         self.edges = EdgeRecorder(options.edge_settings()) if options.export_edge_cloud else None
+        self.observations: Observations | None = None
 
     def track(self, sequence: Recording, cfg: Config, network: torch.nn.Module, device: torch.device) -> TrackingResult:
         """Run the odometry."""
@@ -164,7 +166,7 @@ class _Recorders:
                 height=sequence.height, width=sequence.width, seed=options.seed, colors=True, viz=options.viz,
                 frame_mode=options.frame_mode if options.wants_frames else None, accumulate_map=self.map.wants_map,
                 viz_flow=options.viz_flow, device=device, total=sequence.expected_length, progress=True,
-                keep_on_interrupt=True, on_frame=self._on_frame, on_end=self.map.on_end)
+                keep_on_interrupt=True, on_frame=self._on_frame, on_end=self._on_end)
 
     def _on_frame(self, tracker: DEVO) -> None:
         self.map.on_frame(tracker)
@@ -175,8 +177,15 @@ class _Recorders:
             say(f"frame {tracker.counter - 1} at {tracker.tlist[-1]:.0f} us: {tracker.n} keyframes, {tracker.m} "
                 f"points, {len(tracker.kk)} edges, {explained}")
 
+    def _on_end(self, tracker: DEVO) -> None:
+        self.map.on_end(tracker)
+        if self.options.save_observations and tracker.is_initialized:
+            self.observations = observations_of(tracker)
+
     def note(self, products: Products, record: ExportRecord) -> None:
-        """Enter the files of the map into the record."""
+        """Enter the files of the map into the record, and write the observations."""
+        if self.observations is not None:
+            products.written.append(save_observations(products.path("_observations.npz"), self.observations))
         products.written += self.map.written
         record.frame_clouds = self.map.frame_clouds
         if self.map.full_map_out is not None and Path(self.map.full_map_out) in self.map.written:
