@@ -22,9 +22,11 @@ RADIUS_M = 0.05
 def experiment_emvs_settings() -> EmvsSettings:
     """EMVS settings of the experiment; lengths are set per variant.
 
-    The defaults of the mapper are those of the published program (threshold 5, median 5) and leave a sixth of the
-    points of the simulated board off the plane. The published example settings for hand-held sequences go up to
-    threshold 7 and median 15, which are taken here. Packets are shorter because only some of the events vote.
+    What decides is the depth range: on the simulated board 84 % of the points lie within 2 % of the plane with the
+    published defaults (0.3 to 5 m), 97.5 % with the range that follows from the exported cloud. Threshold 7 and median
+    15 are the far end of the published example settings for hand-held sequences (the defaults are 5 and 5); they
+    leave fewer and cleaner points (99.8 %) to serve as a reference. Packets are shorter than the published 1024 events
+    because only some of the events vote.
     """
     return EmvsSettings(adaptive_threshold_c=7.0, median_filter_size=15, packet_size=256)
 
