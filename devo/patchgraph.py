@@ -57,10 +57,10 @@ class EdgeRecords:
 
 @dataclass
 class DroppedFrame:
-    """What is kept of a keyframe that was removed: its patches and its pose relative to an older keyframe.
+    """What is kept of a keyframe that was removed: its patch centres and its pose relative to an older keyframe.
 
-    `counter` counts accepted frames; `patches (M,3,P,P)` and `intrinsics (4,)` are at quarter resolution;
-    `colors (M,3)` uint8.
+    `counter` counts accepted frames; `patches (M,3,1,1)` (no more than centres, as runs are long) and `intrinsics (4,)`
+    are at quarter resolution; `colors (M,3)` uint8.
     """
 
     counter: int
@@ -110,6 +110,11 @@ class PatchGraph:
     def patches(self) -> Tensor:
         """All patches, `(1, N*M, 3, P, P)`, a view of the buffer."""
         return self.patches_.view(1, self.N * self.M, 3, self.P, self.P)
+
+    def patch_centers(self, rows: int | slice) -> Tensor:
+        """The centres of the patches of some keyframes, `(..., M, 3, 1, 1)`, a view of the buffer."""
+        centre = slice(self.P // 2, self.P // 2 + 1)
+        return self.patches_[rows, ..., centre, centre]
 
     @property
     def intrinsics(self) -> Tensor:
@@ -186,7 +191,7 @@ class PatchGraph:
         self.delta[counter] = (before, relative.data)
         if self.keep_dropped_frames:
             self.dropped_frames.append(DroppedFrame(
-                counter, self.patches_[k].clone(), self.intrinsics_[k].clone(), self.colors_[k].clone()))
+                counter, self.patch_centers(k).clone(), self.intrinsics_[k].clone(), self.colors_[k].clone()))
         self.remove_factors((self.ii == k) | (self.jj == k))
         self._renumber(self, k)
         self.retired_edges = [self._without_keyframe(record, k) for record in self.retired_edges]

@@ -109,7 +109,7 @@ class FrameRecorder:
         """Note the newest keyframe slot of the tracker."""
         tracker, slot = self.tracker, self.tracker.n - 1
         self.snapshots.append(_Snapshot(tracker.counter - 1, float(timestamp), tracker.poses_[slot].clone(),
-                                        tracker.intrinsics_[slot].clone(), tracker.patches_[slot].clone()))
+                                        tracker.intrinsics_[slot].clone(), tracker.patch_centers(slot).clone()))
 
     def collect(self, mode: str = "final") -> list[dict[str, Any]]:
         """One dictionary per recorded frame.
@@ -159,7 +159,7 @@ def accumulated_map(tracker: DEVO) -> tuple[np.ndarray, np.ndarray]:
     poses = camera_poses(tracker)
     dropped = tracker.dropped_frames
     counters = [int(counter) for counter in tracker.tstamps_[:tracker.n].tolist()]
-    patches = torch.cat([tracker.patches_[:tracker.n], *(frame.patches[None] for frame in dropped)])
+    patches = torch.cat([tracker.patch_centers(slice(tracker.n)), *(frame.patches[None] for frame in dropped)])
     intrinsics = torch.cat([tracker.intrinsics_[:tracker.n], *(frame.intrinsics[None] for frame in dropped)])
     colors = torch.cat([tracker.colors_[:tracker.n], *(frame.colors[None] for frame in dropped)]).flatten(0, 1)
     hosts = torch.tensor(counters + [frame.counter for frame in dropped], device=tracker.device)

@@ -121,7 +121,9 @@ def export_pointcloud(options: ExportOptions) -> dict[str, Any]:
         products.written.append(_save_flow(products, result.flowdata))
     if bundle is not None and recorders.edges is not None:
         _write_edges(products, record, "edge_cloud", recorders.edges.cloud(bundle))
-    if bundle is not None and options.export_focus_edge_cloud:
+    if options.export_focus_edge_cloud and result.counters.get("interrupted"):
+        say("interrupted: the focus-refined edge cloud, which takes another pass over the recording, is left out")
+    elif bundle is not None and options.export_focus_edge_cloud:
         _write_meta(products, record, started)  # the next step reads the recording again and may be interrupted
         _write_edges(products, record, "focus_edge_cloud", _focus_cloud(sequence, bundle, options, device))
     meta = _write_meta(products, record, started)
