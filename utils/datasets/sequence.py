@@ -180,11 +180,6 @@ class Sequence(Recording):
         """Open the raw events on the clock of the recording; close the reader after use."""
         return self._open_reader()
 
-    @property
-    def rectify_map(self) -> npt.NDArray[np.float32] | None:
-        """The (H, W, 2) forward map of `utils.undistort`, None where raw pixels are those of the pinhole camera."""
-        return self._rectify_map
-
     def frame_stamp_us(self, index: int, window: EventWindow) -> float:
         """Return the stamp of the frame made from window `index`; data sets with another convention override it."""
         return float(window.middle_us)
