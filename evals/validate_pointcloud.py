@@ -73,6 +73,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except DevoError as error:
         print(f"validate_pointcloud.py: error: {' '.join(str(error).split())}", file=sys.stderr)
         return error.exit_code
+    except KeyboardInterrupt:
+        print("validate_pointcloud.py: interrupted; trials that were finished are kept and reused", file=sys.stderr)
+        return 130
     judged = criteria(found, duration_s(found))
     for one in judged:
         print(f"{one.word:>10}  {one.name}: {one.value} (expected {one.limit})" + (f". {one.why}" if one.why else ""))
