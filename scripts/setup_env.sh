@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Make .venv with pinned versions and install this checkout into it. Safe to call again: does nothing if nothing changed.
-# PYTHON chooses the interpreter (3.10 to 3.12), VENV the folder.
+# PYTHON chooses the interpreter (3.10 to 3.12), VENV the folder, EXTRAS the optional dependencies (default dev).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 venv="${VENV:-.venv}"
@@ -22,6 +22,6 @@ fi
 install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "$@"; }
 # torch comes first and pinned: anything else asking for it would pull gigabytes of CUDA packages
 install --constraint constraints.txt torch setuptools wheel
-install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+install --constraint constraints.txt --no-build-isolation --editable ".[${EXTRAS:-dev}]"
 echo "$stamp" > "$venv/.installed"
 echo "setup_env: $("$venv/bin/python" --version) in $venv; activate with: source $venv/bin/activate" >&2
