@@ -11,14 +11,11 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
 
 from scripts.cli import AliasParser, run_cli  # noqa: E402
-
-if TYPE_CHECKING:
-    from utils.clouds.cloud import PointCloud
 
 
 def build_parser() -> AliasParser:
@@ -50,8 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     from devo.errors import DevoError, InputError
     from utils.clouds.filters import clean_cloud
     from utils.clouds.io import read_cloud, write_cloud
+    from utils.viewer.window import has_display, show_cloud
 
-    if options.display and not _has_display():
+    if options.display and not has_display():
         raise InputError("--display: there is no display here; leave it out and look at the written file elsewhere")
     source = Path(options.input_file)
     target = Path(options.output_file) if options.output_file else source.with_stem(f"{source.stem}_cleaned")
@@ -65,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(reports[0] if options.verbose else f"{options.algorithm}: kept {len(cleaned)} of {len(cloud)} points")
     print(target)
     if options.display:
-        _show(cleaned)
+        show_cloud(cleaned, "cleaned cloud")
     return 0
 
 
@@ -84,21 +82,6 @@ def _arguments(options: argparse.Namespace) -> dict[str, Any]:
     if options.algorithm == "ror":
         return {"radius": options.radius, "min_neighbors": options.min_neighbors}
     return {}
-
-
-def _has_display() -> bool:
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _show(cloud: PointCloud) -> None:
-    import open3d
-
-    shown = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.points.astype("float64")))
-    if cloud.colors is not None:
-        shown.colors = open3d.utility.Vector3dVector(cloud.colors / 255.0)
-    open3d.visualization.draw_geometries([shown], window_name="cleaned cloud")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ def add_recording_options(parser: argparse.ArgumentParser, flag: str = "--datapa
     add("--dataset", default="auto", help="how to read it: generic, fpv, rpg, vector, ...; auto looks at its files")
     add("--stride", type=int, default=1, help="use every n-th window")
     add("--side", default="left", help="camera of a stereo recording")
+    add("--stream", metavar="NAME", help="generic: topic or group (or part of it) of a file with several cameras")
     add("--start_us", type=float, help="first time [us]")
     add("--stop_us", type=float, help="last time [us]")
     add("--window_ms", type=float, help="length of the event windows [ms]")
@@ -40,5 +41,5 @@ def open_recording(args: argparse.Namespace) -> Recording:
         side=args.side, stride=args.stride, start_us=args.start_us, stop_us=args.stop_us, window_ms=args.window_ms,
         window_events=args.window_events, calib=Path(args.calib) if args.calib else None,
         image_size=tuple(args.image_size) if args.image_size else None,
-        intrinsics=tuple(args.intrinsics) if args.intrinsics else None)
+        intrinsics=tuple(args.intrinsics) if args.intrinsics else None, stream=args.stream)
     return open_sequence(args.dataset, args.datapath, options)

@@ -40,6 +40,7 @@ class ExportOptions:
     rgb: bool = False
     stride: int = 1
     side: str = "left"
+    stream: str | None = None
     start_us: float | None = None
     stop_us: float | None = None
     window_ms: float | None = None
@@ -142,7 +143,7 @@ class ExportOptions:
             side=self.side, stride=self.stride, start_us=self.start_us, stop_us=self.stop_us, window_ms=self.window_ms,
             window_events=self.window_events, calib=Path(self.calib) if self.calib else None,
             image_size=(self.image_size[0], self.image_size[1]) if self.image_size else None,
-            intrinsics=tuple(self.intrinsics) if self.intrinsics else None)
+            intrinsics=tuple(self.intrinsics) if self.intrinsics else None, stream=self.stream)
 
     def outlier_step(self) -> tuple[str, dict[str, Any]]:
         """The chosen outlier filter for `utils.clouds.filters.clean_cloud`."""

@@ -58,7 +58,8 @@ def open_generic(path: Path, options: SequenceOptions) -> Sequence:
     size = (calibration.width, calibration.height)
 
     def open_reader() -> EventReader:
-        return open_events(event_file, sensor_size=size, time_unit=options.time_unit, on_unsorted=options.on_unsorted)
+        return open_events(event_file, sensor_size=size, time_unit=options.time_unit, on_unsorted=options.on_unsorted,
+                           stream=options.stream)
 
     positions: npt.NDArray[np.float32] | None = None
     intrinsics = calibration.intrinsics
@@ -104,7 +105,8 @@ def _files_with_events(folder: Path, options: SequenceOptions) -> tuple[list[Pat
         if file.suffix.lower() not in EVENT_SUFFIXES or file.name in NOT_EVENT_NAMES or not file.is_file():
             continue
         try:
-            open_events(file, time_unit=options.time_unit, on_unsorted=options.on_unsorted).close()
+            open_events(file, time_unit=options.time_unit, on_unsorted=options.on_unsorted,
+                        stream=options.stream).close()
             accepted.append(file)
         except InputError as error:
             reasons.append(str(error))
@@ -112,7 +114,8 @@ def _files_with_events(folder: Path, options: SequenceOptions) -> tuple[list[Pat
 
 
 def _find_calibration(event_file: Path, options: SequenceOptions, files: dict[str, Path]) -> Calibration:
-    with open_events(event_file, time_unit=options.time_unit, on_unsorted=options.on_unsorted) as reader:
+    with open_events(event_file, time_unit=options.time_unit, on_unsorted=options.on_unsorted,
+                     stream=options.stream) as reader:
         size_in_events = reader.sensor_size
     if options.intrinsics is not None:
         size = options.image_size or size_in_events

@@ -27,6 +27,7 @@ class SequenceOptions:
         intrinsics: `fx fy cx cy` of a camera without distortion, instead of a calibration file.
         time_unit: unit of the stamps in the event file, where it cannot be told from the file.
         on_unsorted: what to do about unsorted stamps: "error" or "sort" (loads the whole file).
+        stream: which event stream of a file with several (a topic, or a part of its name); generic recordings only.
 
     Raises:
         InputError: values that contradict each other or make no sense.
@@ -44,6 +45,7 @@ class SequenceOptions:
     intrinsics: tuple[float, ...] | None = None
     time_unit: TimeUnit | None = None
     on_unsorted: Order = "error"
+    stream: str | None = None
 
     def __post_init__(self) -> None:
         if self.side not in ("left", "right"):

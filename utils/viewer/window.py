@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from devo.errors import DevoError
+from utils.clouds.cloud import PointCloud
 from utils.plots.coloring import NO_COLOR, OWN_COLORS
 from utils.plots.draw import BACKGROUND, LOOK, PATH, PLAIN, START, color_map
 from utils.plots.scene import FRUSTUM_EDGES, Scene
@@ -73,6 +74,12 @@ def show(scene: Scene, title: str) -> None:
     control.set_up([0.0, -1.0, 0.0])  # the world's y points down, as in an image
     window.run()
     window.destroy_window()
+
+
+def show_cloud(cloud: PointCloud, title: str) -> None:
+    """Open a window with the points alone, in their own colours if they have any; see `show`."""
+    color_by = OWN_COLORS if cloud.colors is not None else "depth"
+    show(Scene.build(cloud, np.empty((0, 7)), color_by, show_outside=True, most_points=max(len(cloud), 1)), title)
 
 
 def _open3d() -> Any:
