@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -296,6 +297,13 @@ def test_bags_without_what_is_needed(tmp_path: Path) -> None:
     (tmp_path / "text.bag").write_text("no bag at all\n")
     with pytest.raises(InputError, match="text.bag: damaged or unreadable bag"):
         preprocess("rpg", tmp_path / "text.bag")
+
+
+def test_bags_without_the_package_that_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = stereo_bags.write_rpg(tmp_path, recording(count=20), np.eye(4))
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(InputError, match="reading bags needs the package rosbags; get it with pip install rosbags"):
+        preprocess("rpg", path)
 
 
 def test_bags_of_silent_cameras(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import cv2
@@ -118,6 +121,21 @@ def test_parallel_work(tmp_path: Path) -> None:
         preprocess("ecd", tmp_path, jobs=4)
     assert (tmp_path / "good" / "rectify_map.h5").is_file()
     assert not (bad / "rectify_map.h5").exists()
+
+
+def test_a_killed_process_is_explained(dataset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Killed(contextlib.nullcontext):
+        """A pool whose processes die at once."""
+
+        def submit(self, *arguments: object) -> Future:
+            future: Future = Future()
+            future.set_exception(BrokenProcessPool())
+            return future
+
+    monkeypatch.setattr("utils.preprocessing.runner.ProcessPoolExecutor", lambda *_, **__: Killed(Killed()))
+    add(tmp_path, "a", "1"), add(tmp_path, "b", "2")
+    with pytest.raises(DevoError, match="was killed, probably for want of memory; run the command again with fewer"):
+        preprocess(dataset, tmp_path, jobs=2)
 
 
 def test_formats_of_products(tmp_path: Path) -> None:

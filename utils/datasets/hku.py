@@ -25,6 +25,7 @@ from utils.datasets.prepared import (
 )
 from utils.datasets.registry import register
 from utils.datasets.sequence import Frame, Sequence
+from utils.datasets.stereo_files import stereo_files
 from utils.events.reader import EventReader, open_events
 from utils.sequence_names import find_in_path
 from utils.undistort import read_rectify_map
@@ -97,8 +98,9 @@ def open_hku(path: Path, options: SequenceOptions) -> Sequence:
     refuse_own_camera(options, "hku")
     side = options.side
     command = f"python scripts/pp_hku.py {path} --side {side}"
-    files = {"events": path / f"evs_{side}.h5", "image stamps": path / f"tss_imgs_us_{side}.txt",
-             "intrinsics": path / f"calib_undist_{side}.txt", "rectify map": path / f"rectify_map_{side}.h5"}
+    made = stereo_files(path, side, ".h5")
+    files = {"events": made.events, "image stamps": made.stamps, "intrinsics": made.pinhole,
+             "rectify map": made.rectify_map}
     require_files(path, [file.name for file in files.values()], command)
     all_stamps = read_stamps(files["image stamps"])
     try:
@@ -106,8 +108,8 @@ def open_hku(path: Path, options: SequenceOptions) -> Sequence:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     windows, options = stamp_windows(stamps, options, mean_interval_us(all_stamps, files["image stamps"]))
-    if (poses := path / f"gt_stamped_{side}.txt").is_file():
-        files["ground truth"] = poses
+    if made.poses.is_file():
+        files["ground truth"] = made.poses
 
     def open_reader() -> EventReader:
         return open_events(files["events"], sensor_size=_SIZE, time_unit="us", on_unsorted=options.on_unsorted)
@@ -116,8 +118,8 @@ def open_hku(path: Path, options: SequenceOptions) -> Sequence:
     return Sequence(
         path.resolve().name, path, options, size=_SIZE, intrinsics=intrinsics, open_reader=open_reader,
         windows=windows, rectify_map=read_rectify_map(files["rectify map"], _SIZE),
-        images=find_images(path / f"images_undistorted_{side}", all_stamps, lambda: intrinsics, command),
-        read_ground_truth=poses_reader(poses), files=files)
+        images=find_images(made.images, all_stamps, lambda: intrinsics, command),
+        read_ground_truth=poses_reader(made.poses), files=files)
 
 
 def hku_evs_iterator(indir: str | os.PathLike[str], side: str = "left", stride: int = 1, timing: bool = False,

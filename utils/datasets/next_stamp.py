@@ -44,8 +44,11 @@ class NextStampWindows(StampWindows):
 
     def _borders(self, reader: EventReader, start_us: float | None, stop_us: float | None,
                  every: int) -> tuple[list[float], list[float]]:
+        used = self.stamps_in_use(start_us, stop_us, every)
+        if not len(used):
+            return [], []
         starts, stops = super()._borders(reader, start_us, stop_us, every)
-        count = int(np.searchsorted(starts, self.stamps_in_use(start_us, stop_us, every)[-1:].sum()))
+        count = int(np.searchsorted(starts, used[-1]))
         return starts[:count], stops[:count]
 
 

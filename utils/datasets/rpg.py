@@ -11,6 +11,7 @@ from utils.datasets.options import SequenceOptions
 from utils.datasets.prepared import require_size
 from utils.datasets.registry import register
 from utils.datasets.sequence import Frame, Sequence
+from utils.datasets.stereo_files import stereo_files
 
 _SIZE = (240, 180)
 _SIMULATED_SIZE = (346, 260)
@@ -35,11 +36,12 @@ def open_rpg(path: Path, options: SequenceOptions) -> Sequence:
         InputError: files are missing or damaged, or do not fit together.
     """
     side, simulated = options.side, is_simulated(path)
+    files = stereo_files(path, side, ".txt")
     layout = TextLayout(
         "rpg", f"python scripts/pp_rpg.py {path} --side {side}", _SIMULATED_SIZE if simulated else _SIZE,
-        events=f"evs_{side}.txt", stamps=f"tss_imgs_us_{side}.txt", pinhole=f"calib_undist_{side}.txt",
-        images=f"images_undistorted_{side}", poses=f"gt_stamped_{side}.txt",
-        rectify_map=None if simulated else f"rectify_map_{side}.h5", events_unit="us", window_ms=(3, 1000))
+        events=files.events.name, stamps=files.stamps.name, pinhole=files.pinhole.name, images=files.images.name,
+        poses=files.poses.name, rectify_map=None if simulated else files.rectify_map.name, events_unit="us",
+        window_ms=(3, 1000))
     return open_text_sequence(path, options, layout)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -52,10 +51,10 @@ class BagCamera:
     """
 
     def __init__(self, path: Path) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
         self.path = path
         self._bag = open_bag(path)
+        from rosbags.typesys import Stores, get_typestore  # after open_bag, which says what to do if it is missing
+
         self._store = get_typestore(Stores.ROS1_NOETIC)
         self.topics = {connection.topic: connection.msgtype for connection in self._bag.connections}
 
@@ -64,8 +63,7 @@ class BagCamera:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        with contextlib.suppress(Exception) if error is not None else contextlib.nullcontext():
-            self._bag.close()
+        self._bag.close()
 
     def first_topic(self, candidates: list[str]) -> str:
         """Return the first of these topics that the bag has.

@@ -53,4 +53,4 @@ def outputs(folder: Path, side: str) -> list[Path]:
 
 register(Preprocessor(
     "ecd", "folders with events.txt, images.txt, images/ and calib.txt",
-    lambda root, side: walk_folders(root, _is_sequence) if root.is_dir() else [], run, outputs, ("left",)))
+    lambda root, side: walk_folders(root, _is_sequence), run, outputs, ("left",)))

@@ -99,5 +99,5 @@ def outputs(folder: Path, side: str) -> list[Path]:
 
 register(Preprocessor(
     "eds", "folders with events.h5, images_timestamps.txt, images/ and stamped_groundtruth.txt",
-    lambda root, side: walk_folders(root, lambda folder: (folder / RAW_STAMPS_FILE).is_file()) if root.is_dir() else [],
+    lambda root, side: walk_folders(root, lambda folder: (folder / RAW_STAMPS_FILE).is_file()),
     run, outputs, ("left",)))

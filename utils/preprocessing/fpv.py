@@ -134,4 +134,4 @@ def outputs(folder: Path, side: str) -> list[Path]:
 
 register(Preprocessor(
     "fpv", "folders with events.txt, images.txt, img/ and, where there is ground truth, groundtruth.txt",
-    lambda root, side: walk_folders(root, _is_sequence) if root.is_dir() else [], run, outputs, ("left",)))
+    lambda root, side: walk_folders(root, _is_sequence), run, outputs, ("left",)))

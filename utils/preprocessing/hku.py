@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from utils.calibration import Calibration
+from utils.datasets.stereo_files import stereo_files
 from utils.preprocessing.bag_camera import BagCamera, Topics
 from utils.preprocessing.poses import inverse, rigid
 from utils.preprocessing.registry import PreprocessOptions, Preprocessor, register
-from utils.preprocessing.stereo_bag import BagRecipe, SideFiles, find_bags, run_bag
+from utils.preprocessing.stereo_bag import BagRecipe, find_bags, run_bag
 
 CAMERAS = {
     "left": Calibration(
@@ -41,12 +42,13 @@ def run(folder: Path, options: PreprocessOptions) -> list[Path]:
         return Topics(bag.first_topic([f"/davis_{side}/events"]), bag.first_topic([f"/davis_{side}/image_raw"]),
                       _POSES if _POSES in bag.topics else None)
 
-    return run_bag(BagRecipe(SideFiles(folder, side, ".h5"), find_topics, CAMERAS[side], BODY_T_CAM[side]), options)
+    recipe = BagRecipe(folder, stereo_files(folder, side, ".h5"), find_topics, CAMERAS[side], BODY_T_CAM[side])
+    return run_bag(recipe, options)
 
 
 def outputs(folder: Path, side: str) -> list[Path]:
     """Files that an event run needs."""
-    files = SideFiles(folder, side, ".h5")
+    files = stereo_files(folder, side, ".h5")
     return [files.events, files.stamps, files.pinhole, files.rectify_map]
 
 

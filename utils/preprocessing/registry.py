@@ -85,9 +85,9 @@ def register(preprocessor: Preprocessor) -> Preprocessor:
 def walk_folders(root: Path, is_sequence: Callable[[Path], bool]) -> list[Path]:
     """Return the folders at or below `root` that satisfy `is_sequence`, sorted; sequences are not searched further.
 
-    Hidden folders are left out, links are followed once.
+    Hidden folders are left out, links are followed once; there is nothing below what is no folder.
     """
-    return sorted(_walk(root, is_sequence, set()))
+    return sorted(_walk(root, is_sequence, set())) if root.is_dir() else []
 
 
 def _walk(folder: Path, is_sequence: Callable[[Path], bool], seen: set[str]) -> Iterator[Path]:

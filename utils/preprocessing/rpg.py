@@ -8,10 +8,11 @@ import numpy as np
 
 from utils.calibration import Calibration
 from utils.datasets.rpg import is_simulated
+from utils.datasets.stereo_files import stereo_files
 from utils.preprocessing.bag_camera import BagCamera, Topics
 from utils.preprocessing.poses import inverse, rigid
 from utils.preprocessing.registry import PreprocessOptions, Preprocessor, register
-from utils.preprocessing.stereo_bag import BagRecipe, SideFiles, find_bags, run_bag
+from utils.preprocessing.stereo_bag import BagRecipe, find_bags, run_bag
 
 CAMERAS = {
     "left": Calibration(
@@ -46,14 +47,14 @@ def run(folder: Path, options: PreprocessOptions) -> list[Path]:
         return Topics(events, bag.first_topic([f"{prefix}/image_raw"]), poses if poses in bag.topics else None,
                       bag.first_topic([f"{prefix}/camera_info"]) if simulated else None)
 
-    files = SideFiles(folder, side, ".txt")
-    return run_bag(BagRecipe(files, find_topics, None if simulated else CAMERAS[side],
+    files = stereo_files(folder, side, ".txt")
+    return run_bag(BagRecipe(folder, files, find_topics, None if simulated else CAMERAS[side],
                              np.eye(4) if simulated else MARKER_T_CAM[side]), options)
 
 
 def outputs(folder: Path, side: str) -> list[Path]:
     """Files that an event run needs."""
-    files = SideFiles(folder, side, ".txt")
+    files = stereo_files(folder, side, ".txt")
     return [files.events, files.stamps, files.pinhole] + ([] if is_simulated(folder) else [files.rectify_map])
 
 

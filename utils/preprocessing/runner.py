@@ -6,6 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,10 +66,10 @@ def find_sequences(dataset: str, root: str | os.PathLike[str], side: str = "left
     if options.side not in preprocessor.sides:
         raise InputError(f"side {side!r} was given, but recordings of {dataset} have one camera; leave --side out")
     root = Path(root)
-    if not root.exists() and not preprocessor.find_sequences(root, side):
-        raise InputError(f"{root} does not exist, expected recordings of {dataset}: {preprocessor.layout}")
     folders = preprocessor.find_sequences(root, side)
     if not folders:
+        if not root.exists():
+            raise InputError(f"{root} does not exist, expected recordings of {dataset}: {preprocessor.layout}")
         raise InputError(f"{root}: no recording of {dataset} found, expected {preprocessor.layout}")
     return preprocessor, folders
 
@@ -84,8 +85,12 @@ def _results(preprocessor: Preprocessor, folders: list[Path], options: Preproces
     with ProcessPoolExecutor(jobs, mp_context=context) as pool:
         waiting = {pool.submit(_run_one, preprocessor.name, folder, replace(options, progress=False)): folder
                    for folder in folders}
-        for done in as_completed(waiting):
-            yield waiting[done], done.result()
+        try:
+            for done in as_completed(waiting):
+                yield waiting[done], done.result()
+        except BrokenProcessPool:
+            raise DevoError(f"a process that preprocessed {preprocessor.name} was killed, probably for want of memory; "
+                            "run the command again with fewer --jobs, it goes on where it was") from None
 
 
 def _run_one(dataset: str, folder: Path, options: PreprocessOptions) -> list[Path] | DevoError:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from devo.errors import InputError
 from utils.calibration import Calibration
+from utils.datasets.stereo_files import StereoFiles
 from utils.events.writers import EventH5Writer
 from utils.preprocessing.bag_camera import BagCamera, EventBlock, Topics
 from utils.preprocessing.poses import times_transform
@@ -23,56 +24,19 @@ from utils.undistort import ImageUndistorter
 
 
 @dataclass(frozen=True)
-class SideFiles:
-    """Names of the products of one side in the folder of a recording; the rectification map is made by most."""
-
-    folder: Path
-    side: str
-    events_suffix: str
-
-    @property
-    def events(self) -> Path:
-        """Events, stamps in microseconds."""
-        return self.folder / f"evs_{self.side}{self.events_suffix}"
-
-    @property
-    def stamps(self) -> Path:
-        """Image stamps in microseconds."""
-        return self.folder / f"tss_imgs_us_{self.side}.txt"
-
-    @property
-    def poses(self) -> Path:
-        """Camera poses."""
-        return self.folder / f"gt_stamped_{self.side}.txt"
-
-    @property
-    def pinhole(self) -> Path:
-        """Undistorted camera."""
-        return self.folder / f"calib_undist_{self.side}.txt"
-
-    @property
-    def rectify_map(self) -> Path:
-        """Where each pixel lies in the undistorted image."""
-        return self.folder / f"rectify_map_{self.side}.h5"
-
-    @property
-    def images(self) -> Path:
-        """Undistorted images."""
-        return self.folder / f"images_undistorted_{self.side}"
-
-
-@dataclass(frozen=True)
 class BagRecipe:
     """How the bag of one recording becomes products.
 
     Attributes:
+        folder: where the products go; the bag is beside it.
         files: what to make.
         find_topics: chooses the topics of the side.
         calibration: the camera; None takes a camera without distortion from the topic of camera info.
         body_T_cam: (4, 4) from the camera to the body that the poses are of.
     """
 
-    files: SideFiles
+    folder: Path
+    files: StereoFiles
     find_topics: Callable[[BagCamera], Topics]
     calibration: Calibration | None
     body_T_cam: npt.NDArray[np.float64]
@@ -86,7 +50,7 @@ def run_bag(recipe: BagRecipe, options: PreprocessOptions) -> list[Path]:
         OutputError: a product cannot be written.
     """
     products, files = Products(options), recipe.files
-    with BagCamera(bag_of(files.folder)) as bag:
+    with BagCamera(bag_of(recipe.folder)) as bag:
         topics = recipe.find_topics(bag)
         calibration = recipe.calibration
         if calibration is None:
@@ -106,10 +70,10 @@ def _write_clocked(bag: BagCamera, topics: Topics, calibration: Calibration, rec
                    products: Products) -> None:
     """Make the products whose stamps are counted from the beginning of the recording."""
     files = recipe.files
-    poses = bag.poses(topics.poses) if topics.poses is not None else None
-    needed = [files.stamps, files.events] + ([files.poses] if poses is not None else [])
-    if not products.missing(*needed):
+    has_poses = topics.poses is not None and bag.count(topics.poses) > 0
+    if not products.missing(files.stamps, files.events, *([files.poses] if has_poses else [])):
         return
+    poses = bag.poses(topics.poses) if topics.poses is not None else None
     stamps_ns = bag.image_stamps_ns(topics.images)
     first_ns = [bag.first_event_ns(topics.events, products.options.on_unsorted), int(stamps_ns.min())]
     if poses is not None:

@@ -36,14 +36,14 @@ def run(folder: Path, options: PreprocessOptions) -> list[Path]:
     """Make calibrations, rectification map and images of one side of a sequence; the clock stays as it is."""
     products, side = Products(options), options.side
     only_match(folder, event_pattern(side), f"event file of the {side} camera of TUM-VIE")
+    source, target = folder / f"{side}_images", folder / f"{side}_images_undistorted"
+    stamps = source / f"image_timestamps_{side}.txt"
+    count = len(read_stamps(stamps))
     raw, undistorted = folder / RAW_CALIBRATION, folder / CALIBRATION_FILE
     if products.missing(raw, undistorted):
         _make_calibrations(products, raw, undistorted, find_calibration(folder))
     products.map(folder / f"rectify_map_{side}.h5", read_camera(undistorted, CAMERAS[side]),
                  read_undistorted(undistorted, CAMERAS[side]))
-    source, target = folder / f"{side}_images", folder / f"{side}_images_undistorted"
-    stamps = source / f"image_timestamps_{side}.txt"
-    count = len(read_stamps(stamps))
     if options.images:
         _make_images(products, source, target, count, undistorted, side)
     for text in (stamps, source / f"image_exposures_{side}.txt"):  # the images' folder is replaced as a whole
@@ -99,5 +99,5 @@ def outputs(folder: Path, side: str) -> list[Path]:
 
 register(Preprocessor(
     "tumvie", "folders with *events_{left,right}.h5 and {left,right}_images/, beside camera-calibration{A,B}.json",
-    lambda root, side: walk_folders(root, lambda folder: _is_sequence(folder, side)) if root.is_dir() else [],
+    lambda root, side: walk_folders(root, lambda folder: _is_sequence(folder, side)),
     run, outputs))

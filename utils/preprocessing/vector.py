@@ -139,5 +139,5 @@ def outputs(folder: Path, side: str) -> list[Path]:
 
 register(Preprocessor(
     "vector", "folders with {sequence}1.synced.{left,right}_event.hdf5, ..._camera/ and ...gt.txt, beside 0_calib/",
-    lambda root, side: walk_folders(root, lambda folder: _is_sequence(folder, side)) if root.is_dir() else [],
+    lambda root, side: walk_folders(root, lambda folder: _is_sequence(folder, side)),
     run, outputs))
