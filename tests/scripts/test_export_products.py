@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -178,6 +181,27 @@ def test_named_files_go_where_they_were_asked_for(export: Callable[..., dict], t
     assert {path.name for path in (tmp_path / "x").iterdir()} == {"edges.npy", "edges.ply"}
     assert {path.name for path in (tmp_path / "y").iterdir()} == {"frames.npz", "frames.csv"}
     assert not (tmp_path / "z" / "run_frames.npz").exists() and meta["cleaned_points"] is None
+
+
+def test_ctrl_c_keeps_what_exists_and_ends_the_look_ahead(export: Callable[..., dict], tmp_path: Path,
+                                                          monkeypatch: pytest.MonkeyPatch,
+                                                          capsys: pytest.CaptureFixture[str]) -> None:
+    original, calls = OracleTracker.append_factors, []
+
+    def append(self: OracleTracker, *arguments: torch.Tensor) -> None:
+        calls.append(1)
+        if len(calls) == 21:  # two calls per keyframe
+            os.kill(os.getpid(), signal.SIGINT)
+        original(self, *arguments)
+
+    monkeypatch.setattr(OracleTracker, "append_factors", append)
+    with pytest.raises(AssertionError):  # exit code 1
+        export("--export_edge_cloud", "--export_focus_edge_cloud", "--export_frame_data")
+    meta = json.loads((tmp_path / "out" / "run_meta.json").read_text())
+    assert meta["counters"]["interrupted"] == 1 and 8 < meta["num_poses"] < FRAMES
+    assert meta["edge_cloud_exported"] and not meta["focus_edge_cloud_exported"]
+    assert "interrupted" in capsys.readouterr().err
+    assert not [thread for thread in threading.enumerate() if thread.name == "prefetch"]
 
 
 def test_run_voxel_writes_the_edge_cloud(scene: OracleScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

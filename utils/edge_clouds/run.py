@@ -37,7 +37,7 @@ def collect_focus_cloud(frames: Iterable[Frame], bundle: FrameBundle, settings: 
     total = min(total, settings.max_keyframes) if settings.max_keyframes else total
     clouds = list(tqdm(refine_edges(frames, bundle, settings, device, image_dtype=image_dtype), total=total,
                        unit="frame", desc="focus", disable=progress_every == 0, miniters=progress_every))
-    travel = float(np.median([float(cloud.metadata["band_travel_px"]) for cloud in clouds]))
+    travel = float(np.median([float(cloud.metadata["band_travel_px"]) for cloud in clouds] or [0.0]))
     if travel < LEAST_TRAVEL_PX:
         say(f"focus: the tried depths are only {travel:.1f} pixels apart in the farthest event image, so most of them "
             "cannot be told apart; raise --focus_support_stride or --focus_support, or lower --focus_downsample")
