@@ -188,7 +188,10 @@ def find_images(folder: Path, stamps_us: Stamps, read_intrinsics: Callable[[], n
     if len(paths) != len(stamps_us):
         return (f"{folder.name} holds {len(paths)} images for {len(stamps_us)} stamps; complete them with "
                 f"`{make_them}`")
-    return ImageFiles(paths, stamps_us, read_intrinsics())
+    try:
+        return ImageFiles(paths, stamps_us, read_intrinsics())
+    except InputError as error:
+        return str(error)
 
 
 def poses_reader(path: Path, *, time_unit: str = "us", skip_lines: int = 0) -> Callable[[], GroundTruth] | None:
