@@ -46,6 +46,11 @@ DEFAULTS: dict[str, Any] = {
     # inverse depth of new patches before initialisation; 0 = random in (0,1) as published, which on scenes with little
     # relief often ends in the mirrored solution (scene and motion inverted)
     "INITIAL_INV_DEPTH": 0.5,
+    # updates of the first structure, once enough keyframes are there
+    "INITIAL_UPDATES": 12,
+    # solve for the first structure twice, the second time from its reversed relief, and keep what explains more; False
+    # as published
+    "MIRROR_TEST": True,
     # poses of frames that were passed over before initialisation because the camera had hardly moved: interpolate (in
     # time, between the keyframes around them) or hold (that of the keyframe before, as published)
     "STILL_FRAMES": "interpolate",
@@ -58,7 +63,7 @@ DEFAULTS: dict[str, Any] = {
 _AT_LEAST = {
     "BUFFER_SIZE": 9, "PATCHES_PER_FRAME": 1, "REMOVAL_WINDOW": 1, "OPTIMIZATION_WINDOW": 1, "PATCH_LIFETIME": 1,
     "KEYFRAME_INDEX": 2, "KEYFRAME_THRESH": 0.0, "MOTION_DAMPING": 0.0, "RING_SIZE": 0,
-    "INITIAL_INV_DEPTH": 0.0,
+    "INITIAL_INV_DEPTH": 0.0, "INITIAL_UPDATES": 1,
 }
 _CHOICES = {"STILL_FRAMES": ("interpolate", "hold")}
 

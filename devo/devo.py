@@ -26,6 +26,7 @@ from devo.checkpoint import load_network
 from devo.device import autocast, fast_dtype, resolve_device
 from devo.errors import InputError
 from devo.features import FeatureRing
+from devo.initialization import initialize
 from devo.lietorch import SE3
 from devo.normalize import normalize_voxel
 from devo.observables import build_observables
@@ -33,7 +34,6 @@ from devo.patchgraph import PatchGraph
 from devo.result import INITIAL_KEYFRAMES, LOST_AFTER, MIN_EVENT_SHARE, TrackingResult, TrackingStatus, explain
 from devo.trajectory import FrameRecorder, accumulated_map, full_trajectory
 
-INITIAL_UPDATES = 12
 FINAL_UPDATES = 12
 PROBE_FLOW = 2.0  # quarter-resolution px of median flow that make a frame worth keeping before initialisation
 MIN_IMAGE_SIDE = 32
@@ -90,6 +90,7 @@ class DEVO(PatchGraph):
         self.flow_data: dict[int, dict[str, Any]] = {}
         self.frames = FrameRecorder(self) if record_frame_observables else None
         self.counters: dict[str, int] = defaultdict(int)
+        self.last_solve: fastba.BAResult
         self.timings: dict[str, float] = defaultdict(float)
         self.tracked: list[bool] = []
 
@@ -276,9 +277,7 @@ class DEVO(PatchGraph):
             self._note_health()
             self.keyframe()
         elif self.n == INITIAL_KEYFRAMES:
-            self.is_initialized = True
-            for _ in range(INITIAL_UPDATES):
-                self.update()
+            initialize(self)
             self._note_health()
 
     @torch.no_grad()
@@ -302,15 +301,15 @@ class DEVO(PatchGraph):
                                first_free, self.n, 2, image_size=(height, width), accurate=True)
         self.counters["updates"] += 1
         self.counters["ba_failures"] += not solved.success
-        self._last_solve = solved
+        self.last_solve = solved
 
     def _note_health(self) -> None:
         """Note whether the geometry explains the measurements of the newest keyframes."""
         recent = self.jj >= self.n - 2
-        residual = self._last_solve.residual.norm(dim=-1)
-        explained = self._last_solve.valid.bool() & (residual < EXPLAINED_PX)
+        residual = self.last_solve.residual.norm(dim=-1)
+        explained = self.last_solve.valid.bool() & (residual < EXPLAINED_PX)
         share = explained[recent].float().mean() if bool(recent.any()) else torch.zeros(())
-        self.tracked.append(self._last_solve.success and float(share) > 0.5)
+        self.tracked.append(self.last_solve.success and float(share) > 0.5)
 
     def motionmag(self, i: int, j: int) -> float:
         """Mean flow of the edges from keyframe `i` to `j` [quarter-resolution px]; NaN if there are none."""

@@ -12,6 +12,7 @@ Example: python evals/eval_simulated.py --split test --trials 3
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import sys
 import time
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from utils.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 
 SCENES = ("board", "room", "planes", "corridor")
 SIZES = ((240, 180), (346, 260), (320, 240))
@@ -63,20 +65,28 @@ def sequences(split: str) -> Iterator[tuple[str, dict[str, Any]]]:
                 "scene": scene, "seed": seed, "preset": preset, "size": size}
 
 
+def recording_folder(name: str, settings: dict[str, Any], seconds: float, cache: Path) -> Path:
+    """Folder of a sequence in the cache; simulated now if it is not there."""
+    from utils.simulator.dataset_folder import FolderOptions, write_recording
+    from utils.simulator.sequence import SequenceSettings
+
+    folder = cache / f"{name}_{seconds:g}s"
+    if not folder.is_dir():
+        write_recording(folder, SequenceSettings(seconds=seconds, **settings), FolderOptions(depth=False))
+    return folder
+
+
 def evaluate(name: str, settings: dict[str, Any], seconds: float, cache: Path, network: Any, cfg: Any, variant: str,
              trial: int) -> Score:
-    """Simulate the sequence if it is not in the cache, track it and compare with the truth."""
+    """Track a sequence and compare with the truth."""
     import numpy as np
 
     from utils.datasets.registry import SequenceOptions, open_sequence
     from utils.eval_utils import track
-    from utils.simulator.dataset_folder import FolderOptions, write_recording
     from utils.simulator.sequence import SequenceSettings, SimulatedSequence
 
     simulated = SequenceSettings(seconds=seconds, **settings)
-    folder = cache / f"{name}_{seconds:g}s"
-    if not folder.is_dir():
-        write_recording(folder, simulated, FolderOptions(depth=False))
+    folder = recording_folder(name, settings, seconds, cache)
     recording = open_sequence("generic", folder, SequenceOptions())
     start = time.perf_counter()
     result = track(recording.voxels(), cfg, network, seed=trial)
@@ -143,50 +153,100 @@ def summarise(scores: Sequence[Score], variant: str) -> dict[str, Any]:
 
 def build_arg_parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = AliasParser(prog="eval_simulated.py", description=__doc__)
     parser.add_argument("--split", choices=FIRST_SEED, default="test")
     parser.add_argument("--weights", help="default: the built-in ones")
     parser.add_argument("--config", help="default: the preset of the built-in weights")
     parser.add_argument("--opts", nargs="+", default=[], help="override settings, KEY VALUE ...")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--trials", type=int, default=3)
     parser.add_argument("--every", type=int, default=1, help="use every n-th sequence")
     parser.add_argument("--seconds", type=float, default=3.0, help="length of the sequences [s]")
+    parser.add_argument("--jobs", type=int, default=1, help="processes of one thread each; 1 uses all threads in turn")
     parser.add_argument("--cache", type=Path, default=Path("datasets/simulated"), help="where sequences are kept")
     parser.add_argument("--json", type=Path, help="also write all scores to this file")
     return parser
 
 
+@dataclass(frozen=True)
+class Task:
+    """One run: which sequence, which variant of which network, which seed."""
+
+    sequence: str
+    simulated: dict[str, Any]
+    seconds: float
+    cache: Path
+    weights: str
+    settings: dict[str, Any]
+    variant: str
+    trial: int
+
+
+def run_task(task: Task) -> Score:
+    """Do one run; networks are kept from run to run within a process."""
+    from devo.config import Config
+
+    cfg = Config(task.settings)
+    if task.variant == "random patches":
+        cfg.PATCH_SELECTOR = "random"
+    network = _network(task.weights, task.variant, cfg.PATCH_SELECTOR)
+    return evaluate(task.sequence, task.simulated, task.seconds, task.cache, network, cfg, task.variant, task.trial)
+
+
+@functools.lru_cache(maxsize=len(VARIANTS))
+def _network(weights: str, variant: str, selector: str) -> Any:
+    from devo.checkpoint import load_network
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        network: Any = load_network(weights, patch_selector=selector)
+        if variant == "untrained":
+            source = f"random:0:{network.dim_inet},{network.dim_fnet},{network.dim}"
+            network = load_network(source, patch_selector=selector)
+    return network
+
+
+def run_all(tasks: Sequence[Task], jobs: int) -> Iterator[Score]:
+    """Scores in the order of the tasks; `jobs` processes of one thread each, or this process where it is 1."""
+    if jobs == 1:
+        yield from map(run_task, tasks)
+        return
+    import multiprocessing
+
+    with multiprocessing.get_context("spawn").Pool(jobs, _one_thread) as pool:
+        first = {task.sequence: task for task in tasks}  # no two processes may simulate the same one
+        pool.map(_simulate, first.values(), chunksize=1)
+        yield from pool.imap(run_task, tasks)
+
+
+def _simulate(task: Task) -> None:
+    recording_folder(task.sequence, task.simulated, task.seconds, task.cache)
+
+
+def _one_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Evaluate and print Markdown tables."""
     args = build_arg_parser().parse_args(argv)
-    from devo.checkpoint import load_network
     from devo.config import Config
     from utils.export_run import find_config, find_weights
 
     weights = find_weights(args.weights)
     cfg = Config().merge_from_file(find_config(args.config, "generic", weights)).merge_from_list(args.opts)
-    networks: dict[str, tuple[Any, Config]] = {}
-    for variant in args.variants:
-        variant_cfg = cfg.clone()
-        source = weights
-        if variant == "random patches":
-            variant_cfg.PATCH_SELECTOR = "random"
-        if variant == "untrained":
-            trained: Any = load_network(weights)
-            source = f"random:0:{trained.dim_inet},{trained.dim_fnet},{trained.dim}"
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            networks[variant] = load_network(source, patch_selector=variant_cfg.PATCH_SELECTOR), variant_cfg
+    chosen = [(name, settings) for name, settings in sequences(args.split) if settings["scene"] in args.scenes]
+    tasks = [Task(name, settings, args.seconds, args.cache, weights, cfg.as_dict(), variant, trial)
+             for name, settings in chosen[::args.every] for variant in args.variants for trial in range(args.trials)]
     scores: list[Score] = []
     print("| sequence | variant | trial | status | ATE % | depth % | points | keyframes | fps |\n|" + "---|" * 9)
-    for name, settings in list(sequences(args.split))[::args.every]:
-        for variant, (network, variant_cfg) in networks.items():
-            for trial in range(args.trials):
-                score = evaluate(name, settings, args.seconds, args.cache, network, variant_cfg, variant, trial)
-                scores.append(score)
-                print(f"| {name} | {variant} | {trial} | {score.status} | {100 * score.ate:.2f} | "
-                      f"{100 * score.depth:.2f} | {score.points} | {score.keyframes} | {score.fps:.2f} |", flush=True)
+    for score in run_all(tasks, args.jobs):
+        scores.append(score)
+        print(f"| {score.sequence} | {score.variant} | {score.trial} | {score.status} | {100 * score.ate:.2f} | "
+              f"{100 * score.depth:.2f} | {score.points} | {score.keyframes} | {score.fps:.2f} |", flush=True)
     rows = [summarise(scores, variant) for variant in args.variants]
     print("\n| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
     for row in rows:
@@ -198,4 +258,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_cli(main))

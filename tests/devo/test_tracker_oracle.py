@@ -39,7 +39,7 @@ def run_case(oracle: ModuleType, reference: dict[str, np.ndarray], case: str, ri
         "BUFFER_SIZE": 64, "PATCHES_PER_FRAME": params["M"], "KEYFRAME_THRESH": params["kf"],
         "REMOVAL_WINDOW": params["rw"], "OPTIMIZATION_WINDOW": params["ow"], "PATCH_LIFETIME": params["pl"],
         "NORM": "none", "MIXED_PRECISION": False, "RING_SIZE": ring_size, "INITIAL_INV_DEPTH": 0.5,
-        "STILL_FRAMES": "hold"})
+        "STILL_FRAMES": "hold", "MIRROR_TEST": False})
     intrinsics = torch.tensor([110.0, 108.0, 80.0, 60.0])
     network = oracle.OracleNetwork(oracle.BoardScene(frames, params["speed"]), intrinsics, params["M"], 120, 160)
     tracker = DEVO(cfg, network, evs=True, ht=120, wd=160)
