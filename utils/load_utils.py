@@ -7,6 +7,7 @@ from utils.datasets.eds import eds_evs_iterator
 from utils.datasets.files import read_image_list
 from utils.datasets.folders import video_iterator, voxel_iterator
 from utils.datasets.fpv import fpv_evs_iterator
+from utils.datasets.ground_truth import load_ecd_gt, load_eds_traj, load_gt_us, load_mvsec_traj, load_tumvie_traj
 from utils.datasets.hku import hku_evs_iterator
 from utils.datasets.mvsec import mvsec_evs_iterator
 from utils.datasets.registry import DATASETS, SequenceOptions, open_sequence
@@ -21,6 +22,11 @@ __all__ = [
     "eds_evs_iterator",
     "fpv_evs_iterator",
     "hku_evs_iterator",
+    "load_ecd_gt",
+    "load_eds_traj",
+    "load_gt_us",
+    "load_mvsec_traj",
+    "load_tumvie_traj",
     "mvsec_evs_iterator",
     "open_sequence",
     "read_image_list",
