@@ -160,6 +160,10 @@ def _systematic(found: Validation) -> str:
     if error is not None and error.judged and abs(error.bias) > 0.5 * error.median:
         text = (f"The whole cloud lies {abs(error.bias):.1%} too {'far' if error.bias > 0 else 'near'} (median signed "
                 "depth error): its depths do not fit the scale of its own trajectory. ")
+        mapped = found.depth[EMVS_DEVO].bias
+        if mapped * error.bias > 0 and abs(mapped) > 0.5 * abs(error.bias):
+            text += (f"So does the map made with its poses ({mapped:+.1%}), which uses none of its depths: the poses "
+                     "are to blame. ")
     if "after ICP" in agreement.scores:
         score = agreement.score("after ICP", found.judged_m)
         text += (f"After rigid ICP the shares are {score.precision:.1%} (map near the cloud) and {score.recall:.1%} "

@@ -9,11 +9,14 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from devo.errors import InputError, TrackingError
+from devo.poses import matrix_to_pose
 from evals.validation import Validation, ValidationSettings, experiment, odometry, paper, validate, write_report
 from evals.validation.agreement import compare, planarity
 from evals.validation.experiment import CLEANED, EMVS_TRUE, TrialSummary
@@ -213,6 +216,39 @@ def test_a_table_in_its_three_forms() -> None:
 def test_lost_trials_stay_out_of_the_mean(spoilt: Validation) -> None:
     table = next(table for table in make_tables(spoilt, []) if table.name == "trials")
     assert [row[-1] for row in table.rows] == ["no", "lost"]  # one usable trial: no mean
+
+
+# --- pictures -----------------------------------------------------------------------------------------------
+
+
+def test_without_frames_the_events_are_the_picture(perfect: Validation, source: Source) -> None:
+    assert perfect.picture.kind == "accumulated events" and perfect.picture.size == (160, 120)
+    assert 0.01 < perfect.picture.edges.mean() < 0.5
+    np.testing.assert_array_equal(perfect.picture.event_T_image, np.eye(4))
+    assert source.sequence.images is None
+
+
+def test_frames_of_another_camera_use_the_extrinsic_of_the_pose_files(folder: Path, source: Source,
+                                                                      tmp_path: Path) -> None:
+    copy = tmp_path / "framed"
+    (copy / "images").mkdir(parents=True)
+    for name in ("events.h5", "calib.yaml", "groundtruth.txt", "images_timestamps_us.txt"):
+        (copy / name).symlink_to(folder / name)
+    image = np.full((120, 160), 220, np.uint8)
+    image[40:80, 50:110] = 30
+    for number in range(37):
+        cv2.imwrite(str(copy / "images" / f"{number:06d}.png"), image)
+    framed = open_source(quick_settings(copy, tmp_path / "out"))
+    picture = framed.picture(500_000)
+    assert picture.kind == "intensity frame" and picture.t_us == pytest.approx(500_000, abs=17_000)
+    np.testing.assert_array_equal(picture.event_T_image, np.eye(4))
+    assert picture.edges.any() and not picture.edges[:30].any()
+    offset = np.eye(4)
+    offset[:3, :3], offset[:3, 3] = Rotation.from_rotvec([0.02, -0.1, 0.03]).as_matrix(), [0.05, -0.02, 0.01]
+    poses = matrix_to_pose(source.truth.matrices() @ offset)
+    lines = [" ".join(f"{value:.12g}" for value in (t_us, *pose)) for t_us, pose in zip(source.truth.t_us, poses)]
+    (copy / "poses_gray_left.txt").write_text("\n".join(lines) + "\n", "utf-8")
+    np.testing.assert_allclose(framed.picture(500_000).event_T_image, offset, atol=1e-6)
 
 
 # --- input that cannot work ---------------------------------------------------------------------------------
