@@ -26,8 +26,8 @@ from utils.trajectory_io import Trajectory, inverted, read_tum
 CONVENTIONS = ("auto", "T_wc", "T_cw")
 TIME_UNITS = ("auto", "s", "ms", "us", "ns")
 _TAGS = {"T_world_cam": "T_wc", "T_cam_world": "T_cw"}
-_PRODUCTS = ("_cleaned", "_edges", "_focus_edges", "_dpviewer", "_poses", "_tstamps", "_frames", "_meta", "_depths",
-             "_trajectory", "_zdepths")
+_PRODUCTS = ("_cleaned", "_focus_edges", "_edges", "_dpviewer", "_poses", "_observations", "_tstamps", "_frames",
+             "_meta", "_depths", "_trajectory", "_zdepths")
 _LONGEST_SECONDS = 1e5  # a recording of more than a day, or of less than a tenth of a second, is unlikely
 
 
@@ -134,7 +134,8 @@ def read_trajectory(path: str | os.PathLike[str], *, tstamps: str | os.PathLike[
         bundle = read_frame_bundle(path)
         return _trajectory(path, bundle.t_us, inverted(bundle.cam_T_world))
     if path.suffix.lower() == ".npy":
-        return _trajectory(path, _stamps(path, tstamps), read_camera_path(path, convention))
+        poses = read_camera_path(path, convention)
+        return _trajectory(path, _stamps(path, tstamps), poses)
     trajectory = read_tum(path, time_unit="us" if time_unit == "auto" else time_unit)
     if time_unit == "auto" and len(trajectory) and np.ptp(trajectory.t_us) <= _LONGEST_SECONDS:
         trajectory = read_tum(path, time_unit="s")

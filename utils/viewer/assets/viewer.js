@@ -1,7 +1,8 @@
 "use strict";
 (function () {
   const $ = (id) => document.getElementById(id);
-  const view = $("view"), overlay = $("overlay");
+  const overlay = $("overlay");
+  let view = $("view");
   const points = decode(DATA.points, Float32Array), path = decode(DATA.path, Float32Array);
   const palette = decode(DATA.palette, Uint8Array);
   const frames = DATA.frames, cameras = frames.count ? decode(frames.cameras, Float32Array) : new Float32Array(0);
@@ -270,6 +271,7 @@
     $("size").value = DATA.count > 100000 ? 1.5 : DATA.count > 10000 ? 3 : 5;
     $("frame").max = state.frame;
     $("timeline").hidden = frames.count < 2;
+    document.documentElement.dataset.points = DATA.count;
     const bar = $("bar").getContext("2d");
     for (let i = 0; i < 256; i++) {
       bar.fillStyle = `rgb(${palette.subarray(3 * i, 3 * i + 3)})`;
@@ -282,6 +284,9 @@
       if (location.hash === "#canvas") throw new Error("canvas asked for");
       renderer = new WebGlRenderer(view);
     } catch {
+      const fresh = view.cloneNode();  // a canvas that was tried with WebGL gives no other context
+      view.replaceWith(fresh);
+      view = fresh;
       renderer = new CanvasRenderer(view);
     }
     renderer.setPoints(points);
