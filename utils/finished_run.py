@@ -11,7 +11,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +20,10 @@ from devo.errors import InputError
 from utils.clouds.arrays import load_array, load_arrays
 from utils.clouds.cloud import PointCloud
 from utils.clouds.io import SUFFIXES, read_cloud
-from utils.frame_bundle import read_frame_bundle
 from utils.trajectory_io import Trajectory, inverted, read_tum
+
+if TYPE_CHECKING:
+    from utils.frame_bundle import FrameBundle
 
 CONVENTIONS = ("auto", "T_wc", "T_cw")
 TIME_UNITS = ("auto", "s", "ms", "us", "ns")
@@ -92,6 +94,17 @@ def pose_convention(path: Path, asked: str = "auto") -> str:
     return _TAGS[tag]
 
 
+def read_frames(path: str | os.PathLike[str]) -> FrameBundle:
+    """The frame bundle of a run; its poses are world to camera whatever the file holds.
+
+    Raises:
+        InputError: see `utils.frame_bundle.read_frame_bundle`.
+    """
+    from utils.frame_bundle import read_frame_bundle  # late: it needs torch, which takes longer to load than to draw
+
+    return read_frame_bundle(path)
+
+
 def read_camera_path(path: str | os.PathLike[str], convention: str = "auto") -> npt.NDArray[np.float64]:
     """Poses for looking at: `(T, 7)` float64 camera to world; stamps are not needed.
 
@@ -104,7 +117,7 @@ def read_camera_path(path: str | os.PathLike[str], convention: str = "auto") -> 
     """
     path = Path(path)
     if path.suffix.lower() == ".npz":
-        return inverted(read_frame_bundle(path).cam_T_world)
+        return inverted(read_frames(path).cam_T_world)
     if path.suffix.lower() != ".npy":
         return read_trajectory(path, convention=convention).world_T_cam
     poses = load_array(path)
@@ -131,7 +144,7 @@ def read_trajectory(path: str | os.PathLike[str], *, tstamps: str | os.PathLike[
     if time_unit not in TIME_UNITS:
         raise InputError(f"time_unit must be one of {', '.join(TIME_UNITS)}, found {time_unit!r}")
     if path.suffix.lower() == ".npz":
-        bundle = read_frame_bundle(path)
+        bundle = read_frames(path)
         return _trajectory(path, bundle.t_us, inverted(bundle.cam_T_world))
     if path.suffix.lower() == ".npy":
         poses = read_camera_path(path, convention)
@@ -160,7 +173,7 @@ def read_any_cloud(path: str | os.PathLike[str]) -> PointCloud:
     """
     path = Path(path)
     if is_frame_bundle(path):
-        bundle = read_frame_bundle(path)
+        bundle = read_frames(path)
         counts = np.diff(bundle.offsets)
         scalars = {"host_frame": np.repeat(bundle.frame_ids, counts), "t_us": np.repeat(bundle.t_us, counts),
                    "inv_depth": bundle.inv_depths}

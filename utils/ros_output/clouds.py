@@ -14,8 +14,7 @@ from utils.clouds.arrays import load_array
 from utils.clouds.cloud import PointCloud
 from utils.clouds.io import read_cloud
 from utils.events.types import Events
-from utils.finished_run import is_frame_bundle, read_trajectory
-from utils.frame_bundle import read_frame_bundle
+from utils.finished_run import is_frame_bundle, read_frames, read_trajectory
 from utils.ros_output.messages import CAMERA_INFO, CLOUD, EVENT_ARRAY, POSE, RosMessages, new_bag, stamps_ns
 
 TIMESTAMP_UNITS = ("auto", "us", "s")
@@ -106,7 +105,7 @@ def _read_clouds(path: Path, options: BagOptions) -> tuple[list[PointCloud], npt
     """The clouds with their stamps in microseconds."""
     given = None if options.timestamps_npy is None else _given_stamps(options.timestamps_npy, options.timestamp_unit)
     if is_frame_bundle(path):
-        bundle = read_frame_bundle(path)
+        bundle = read_frames(path)
         clouds = [PointCloud(points) for points in np.split(bundle.points, bundle.offsets[1:-1])]
         return _matched(path, clouds[:len(bundle)], bundle.t_us if given is None else given)
     if path.suffix.lower() == ".npy" and (array := load_array(path)).ndim == 3:
