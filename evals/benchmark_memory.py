@@ -79,7 +79,7 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     from devo.checkpoint import load_network
     from devo.config import Config
     from devo.devo import DEVO
-    from utils.datasets.prefetch import prefetch
+    from utils.datasets.prefetch import prefetch_tasks
     from utils.datasets.registry import SequenceOptions, open_sequence
     from utils.edge_clouds.edges import EdgeRecorder
     from utils.edge_clouds.settings import EdgeSettings
@@ -108,7 +108,7 @@ def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             edges.on_frame(tracker)
         samples.append((tracker.counter, resident_mib(), tracker.n))
 
-    frames = prefetch(sequence.voxels())
+    frames = prefetch_tasks(sequence.voxel_tasks(), 1)
     start = time.perf_counter()
     # scale 0 lets every frame count as moving before initialisation, whatever the untrained network says
     result = track(frames if edges is None else edges.tap(frames), cfg, network, height=height, width=width, scale=0.0,

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What decoding and voxelising ahead of the tracker saves: seconds per frame with and without the look-ahead thread.
+"""What decoding and voxelising ahead of the tracker saves: milliseconds per frame by number of worker threads.
 
 A recording of random events is read and voxelised while a stand-in for the tracker works for a fixed time per frame:
 `wait` sleeps, as a tracker on a GPU lets this process wait, `compute` multiplies matrices in one thread of the CPU.
@@ -46,6 +46,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
     add("--size", default="640x480", help="WIDTHxHEIGHT")
     add("--events", type=int, default=500_000, help="events per frame")
     add("--tracker_ms", type=float, default=100.0, help="work of the tracker per frame [ms]")
+    add("--workers", type=int, nargs="+", default=[0, 1, 2])
     add("--repeats", type=int, default=3)
     return parser
 
@@ -56,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     import torch
 
     from evals.benchmark_memory import WINDOW_US, write_random_recording
-    from utils.datasets.prefetch import LOOK_AHEAD, prefetch
+    from utils.datasets.prefetch import prefetch_tasks
     from utils.datasets.registry import SequenceOptions, open_sequence
 
     torch.set_num_threads(1)
@@ -67,18 +68,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = SequenceOptions(intrinsics=(width, width, width / 2, height / 2), image_size=(width, height),
                                   window_ms=WINDOW_US / 1000)
 
-        def seconds_per_frame(look_ahead: int, work: Callable[[], None]) -> float:
+        def seconds_per_frame(workers: int, work: Callable[[], None]) -> float:
             sequence = open_sequence("generic", path, options)
             start = time.perf_counter()
-            for _ in prefetch(sequence.voxels(), look_ahead):
+            for _ in prefetch_tasks(sequence.voxel_tasks(), workers):
                 work()
             return (time.perf_counter() - start) / args.frames
 
-        print("| tracker | without [ms/frame] | look-ahead [ms/frame] | saved |\n|---|---|---|---|")
+        print("| tracker | " + " | ".join(f"{n} workers [ms/frame]" for n in args.workers) + " |")
+        print("|---" * (1 + len(args.workers)) + "|")
         for kind, work in {"none": lambda: None, **trackers(args.tracker_ms)}.items():
-            rows = [(seconds_per_frame(0, work), seconds_per_frame(LOOK_AHEAD, work)) for _ in range(args.repeats)]
-            without, ahead = (statistics.median(column) for column in zip(*rows, strict=True))
-            print(f"| {kind} | {1e3 * without:.0f} | {1e3 * ahead:.0f} | {1 - ahead / without:.0%} |", flush=True)
+            rows = [[seconds_per_frame(n, work) for n in args.workers] for _ in range(args.repeats)]
+            medians = [statistics.median(column) for column in zip(*rows, strict=True)]
+            print(f"| {kind} | " + " | ".join(f"{1e3 * value:.0f}" for value in medians) + " |", flush=True)
     return 0
 
 

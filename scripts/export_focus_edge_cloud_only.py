@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     from devo.device import resolve_device
     from utils.clouds.io import write_cloud
-    from utils.datasets.prefetch import prefetch
+    from utils.datasets.prefetch import prefetch_tasks
     from utils.edge_clouds.run import collect_focus_cloud
     from utils.edge_clouds.settings import FocusSettings
     from utils.export_options import settings_from
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     bundle = read_frame_bundle(args.frames_npz)
     recording = open_recording(args)
     dtype = torch.float16 if args.cache_dtype == "fp16" else torch.float32
-    with contextlib.closing(prefetch(recording.voxels())) as frames:
+    with contextlib.closing(prefetch_tasks(recording.voxel_tasks(), 1)) as frames:
         cloud = collect_focus_cloud(frames, bundle, settings, resolve_device(args.device), image_dtype=dtype,
                                     progress_every=max(args.progress_every, 0))
     write_cloud(out, cloud)

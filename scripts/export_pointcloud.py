@@ -30,7 +30,7 @@ def build_arg_parser(datapath_required: bool = True) -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="seed of patch selection and initial depths")
     add("--rgb", action="store_true", help="use the image frames instead of the events (needs frame weights)")
     add("--workers", type=int, default=1,
-        help="0: decode and voxelise between two frames; N: in a thread, up to 4 N frames in advance; same result")
+        help="threads that voxelise ahead of the tracker, while one more reads; 0 = none; same result")
     add_recording_options(parser, required=datapath_required)
 
     extra = parser.add_argument_group("further products")

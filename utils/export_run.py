@@ -21,7 +21,7 @@ from devo.result import TrackingResult
 from utils.array_files import save_arrays
 from utils.clouds.cloud import PointCloud
 from utils.colmap.observations import Observations, observations_of, save_observations
-from utils.datasets.prefetch import LOOK_AHEAD, prefetch
+from utils.datasets.prefetch import LOOK_AHEAD, prefetch, prefetch_tasks
 from utils.datasets.recognise import AUTO
 from utils.datasets.registry import Recording, locate_sequence, open_sequence
 from utils.edge_clouds.edges import EdgeRecorder
@@ -142,9 +142,11 @@ def _recognised(options: ExportOptions) -> ExportOptions:
 
 @contextlib.contextmanager
 def _stream(sequence: Recording, options: ExportOptions) -> Iterator[Iterable[Frame]]:
-    """The frames of the recording, made in advance by a thread that ends with the block."""
-    frames = sequence.frames() if options.rgb else sequence.voxels()
-    with contextlib.closing(prefetch(frames, LOOK_AHEAD * options.workers)) as ahead:
+    """The frames of the recording, made in advance by threads that end with the block."""
+    workers = options.workers
+    ahead = (prefetch(sequence.frames(), LOOK_AHEAD if workers else 0) if options.rgb
+             else prefetch_tasks(sequence.voxel_tasks(), workers))
+    with contextlib.closing(ahead):
         yield ahead
 
 

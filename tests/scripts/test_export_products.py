@@ -153,9 +153,9 @@ def check_stand_alone(tmp_path: Path, meta: dict) -> None:
 
 
 def test_look_ahead_changes_no_byte(export: Callable[..., dict], tmp_path: Path) -> None:
-    for workers in (0, 1):
+    for workers in (0, 2):
         export("--workers", workers, "--export_edge_cloud", out=f"workers{workers}/run.npy")
-    first, second = (tmp_path / f"workers{workers}" for workers in (0, 1))
+    first, second = (tmp_path / f"workers{workers}" for workers in (0, 2))
     names = sorted(path.name for path in first.iterdir() if path.suffix in (".npy", ".ply", ".npz", ".txt", ".png"))
     assert len(names) > 8
     for name in names:
@@ -201,7 +201,7 @@ def test_ctrl_c_keeps_what_exists_and_ends_the_look_ahead(export: Callable[..., 
     assert meta["counters"]["interrupted"] == 1 and 8 < meta["num_poses"] < FRAMES
     assert meta["edge_cloud_exported"] and not meta["focus_edge_cloud_exported"]
     assert "interrupted" in capsys.readouterr().err
-    assert not [thread for thread in threading.enumerate() if thread.name == "prefetch"]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]
 
 
 def test_run_voxel_writes_the_edge_cloud(scene: OracleScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import signal
 import subprocess
 import sys
@@ -16,13 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devo.errors import InputError
-from utils.datasets.prefetch import prefetch
+from utils.datasets.prefetch import LOOK_AHEAD, prefetch, prefetch_tasks
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def threads() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name == "prefetch"]
+    return [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]
 
 
 @given(st.lists(st.integers(), max_size=20), st.integers(0, 5))
@@ -107,3 +108,42 @@ def test_ctrl_c_while_waiting_for_a_slow_stream_ends_the_program_at_once() -> No
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=20)
     assert output == "interrupted\n" and process.returncode == 0
+
+
+@pytest.mark.parametrize("workers", [0, 1, 3])
+def test_results_of_tasks_come_in_order_however_long_they_take(workers: int) -> None:
+    def task(i: int) -> int:
+        time.sleep(0.004 if i % 3 == 0 else 0.0)
+        return i
+
+    tasks = (functools.partial(task, i) for i in range(20))
+    assert list(prefetch_tasks(tasks, workers)) == list(range(20)) and not threads()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_failing_task_raises_in_its_place(workers: int) -> None:
+    def task(i: int) -> int:
+        if i == 3:
+            raise InputError("frame 3 is damaged")
+        return i
+
+    got = []
+    with pytest.raises(InputError, match="frame 3"):
+        for result in prefetch_tasks((functools.partial(task, i) for i in range(9)), workers):
+            got.append(result)
+    assert got == [0, 1, 2] and not threads()
+
+
+def test_tasks_are_not_started_too_early_and_not_after_the_end() -> None:
+    started: list[int] = []
+    results = prefetch_tasks((functools.partial(started.append, i) for i in range(10**9)), 2)
+    for _ in range(3):
+        next(results)
+    time.sleep(0.05)
+    assert len(started) <= 3 + 2 + LOOK_AHEAD + 1
+    results.close()
+    count = len(started)
+    time.sleep(0.02)
+    assert len(started) == count and not threads()
+    with pytest.raises(InputError, match="workers"):
+        prefetch_tasks([], -1)

@@ -1,10 +1,12 @@
-"""Decode and voxelise the next frames in a thread while the tracker works on the current one."""
+"""Decode and voxelise the next frames in other threads while the tracker works on the current one."""
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import queue
 import threading
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
 from devo.errors import InputError
@@ -39,6 +41,34 @@ def prefetch(items: Iterable[Item], look_ahead: int = LOOK_AHEAD) -> Generator[I
     if look_ahead < 0:
         raise InputError(f"look_ahead is {look_ahead}; expected 0 (no thread) or more")
     return _prefetch(items, look_ahead) if look_ahead else (item for item in items)
+
+
+def prefetch_tasks(tasks: Iterable[Callable[[], Item]], workers: int) -> Generator[Item, None, None]:
+    """The results of `tasks` in their order: one thread goes through the stream, `workers` threads run the tasks.
+
+    At most `workers + LOOK_AHEAD` results or tasks wait. Exceptions and closing as for `prefetch`.
+
+    Args:
+        tasks: the stream, for example `Recording.voxel_tasks()`.
+        workers: threads; 0 runs every task where its result is asked for.
+
+    Raises:
+        InputError: workers is negative.
+    """
+    if workers < 0:
+        raise InputError(f"workers is {workers}; expected 0 (no thread) or more")
+    return _run_ahead(tasks, workers) if workers else (task() for task in tasks)
+
+
+def _run_ahead(tasks: Iterable[Callable[[], Item]], workers: int) -> Generator[Item, None, None]:
+    pool = concurrent.futures.ThreadPoolExecutor(workers, thread_name_prefix="prefetch")
+    futures = prefetch((pool.submit(task) for task in tasks), workers + LOOK_AHEAD)
+    try:
+        with contextlib.closing(futures):
+            for future in futures:
+                yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _prefetch(items: Iterable[Item], look_ahead: int) -> Generator[Item, None, None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,6 +97,11 @@ class Recording(abc.ABC):
         Raises:
             InputError: a file turns out to be damaged, or there is nothing to yield.
         """
+
+    def voxel_tasks(self) -> Iterator[Callable[[], Frame]]:
+        """Yield the frames of `voxels` as calls that make them, which may run in other threads and in any order."""
+        for frame in self.voxels():
+            yield functools.partial(_as_it_is, frame)
 
     def open_events(self) -> EventReader:
         """Open the raw events on the clock of the recording; close the reader after use.
@@ -192,6 +198,11 @@ class Sequence(Recording):
         Raises:
             InputError: the event file turns out to be damaged, or no window holds an event.
         """
+        for task in self.voxel_tasks():
+            yield task()
+
+    def voxel_tasks(self) -> Iterator[Callable[[], Frame]]:
+        """Yield the frames of `voxels` as calls: reading happens here, voxelisation in the calls."""
         counts = {"windows": 0, "empty_windows": 0, "events": 0}
         self._counts = counts
         options = self.options
@@ -204,7 +215,7 @@ class Sequence(Recording):
                     counts["empty_windows"] += 1
                     continue
                 stamp_us = self.frame_stamp_us(index, window)
-                yield self._voxel(window), torch.from_numpy(self.intrinsics.copy()), stamp_us
+                yield functools.partial(self._frame, window, stamp_us)
             if counts["windows"] == counts["empty_windows"]:
                 first, last = reader.time_range_us()
                 raise InputError(f"{self.path}: none of the {counts['windows']} windows holds events, which span "
@@ -220,6 +231,9 @@ class Sequence(Recording):
             "counts": None if self._counts is None else dict(self._counts),
         }
 
+    def _frame(self, window: EventWindow, stamp_us: float) -> Frame:
+        return self._voxel(window), torch.from_numpy(self.intrinsics.copy()), stamp_us
+
     def _voxel(self, window: EventWindow) -> torch.Tensor:
         events = window.events
         if self.rectify_map is None:
@@ -231,6 +245,10 @@ class Sequence(Recording):
             voxel = self._rectifier(events)
         voxel = resize_voxel(voxel, self.height, self.width)
         return voxel if self._hot_pixel_stds is None else remove_hot_pixels(voxel, self._hot_pixel_stds)
+
+
+def _as_it_is(frame: Frame) -> Frame:
+    return frame
 
 
 def read_image(path: Path) -> npt.NDArray[np.uint8]:
