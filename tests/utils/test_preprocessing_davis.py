@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from devo.errors import InputError
-from tests.tolerances import RECTIFIED_INTRINSICS
+from tests.tolerances import RECTIFIED_INTRINSICS, VOXEL_RECTIFIED
 from tests.utils import bag_samples
 from tests.utils.raw_layouts import stereo_bags
 from tests.utils.raw_layouts.recording import EPOCH_US
@@ -158,6 +159,25 @@ def test_wrong_ecd_recordings(name: str, text: str | None, message: str, tmp_pat
         (folder / name).write_text(text)
     with pytest.raises(InputError, match=message):
         preprocess("ecd", folder)
+
+
+def test_a_real_recording_equals_the_same_files_read_as_ones_own(shared_data: Path, tmp_path: Path) -> None:
+    source, folder = shared_data / "slider_depth_chunk", tmp_path / "slider_depth"
+    (folder / "images").mkdir(parents=True)
+    for name, new in (("events_chunk.txt", "events.txt"), ("images.txt",) * 2, ("calib.txt",) * 2,
+                      ("groundtruth.txt",) * 2):
+        shutil.copyfile(source / name, folder / new)
+    own = open_sequence("generic", folder, SequenceOptions(image_size=(240, 180)))
+    expected = list(own.voxels())
+    preprocess("ecd", tmp_path, images=False)
+    sequence = open_sequence("ecd", folder)
+    frames = list(sequence.voxels())
+    assert len(expected) == 4 and len(frames) == 5, "the last window is covered by a fifth, which ecd keeps"
+    for (voxel, intrinsics, t_us), (own_voxel, own_intrinsics, own_t_us) in zip(frames, expected):
+        assert float((voxel - own_voxel).abs().max()) <= VOXEL_RECTIFIED
+        assert intrinsics.tolist() == own_intrinsics.tolist()
+        assert abs(t_us - own_t_us) < 1.0  # recordings of one's own have whole microseconds
+    assert frames[0][2] == 0.5 * 38_766.001
 
 
 # --- bags ----------------------------------------------------------------------------------------------------
@@ -304,6 +324,35 @@ def test_bags_without_the_package_that_reads_them(tmp_path: Path, monkeypatch: p
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(InputError, match="reading bags needs the package rosbags; get it with pip install rosbags"):
         preprocess("rpg", path)
+
+
+def test_damaged_bags_are_refused_or_read(tmp_path: Path) -> None:
+    """Random byte flips and cuts lead to a message or to data, never to another exception."""
+    raw, store = recording((32, 24), count=200), bag_samples.typestore("dvs_msgs", 1)
+    path = stereo_bags.write_bag(tmp_path / "desk_test.bag", store, [
+        *stereo_bags.event_entries("/davis_left/events", raw, 0),
+        *stereo_bags.image_entries(store, "/davis_left/image_raw", raw),
+        *stereo_bags.pose_entries(store, "/optitrack/davis_stereo", raw, np.eye(4), "geometry_msgs/msg/PoseStamped"),
+    ], compression=None)
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    outcomes = set()
+    for number in range(30):
+        damaged = bytearray(whole[:rng.integers(len(whole) // 2, len(whole))] if number % 4 == 0 else whole)
+        for place in rng.integers(0, len(damaged), 2).tolist():
+            damaged[place] = int(rng.integers(0, 256))
+        path.write_bytes(damaged)
+        try:
+            with BagCamera(path) as bag:
+                events, images = bag.first_topic(["/davis_left/events"]), bag.first_topic(["/davis_left/image_raw"])
+                first_ns = bag.first_event_ns(events, "error")
+                count = sum(len(block.events) for block in bag.event_blocks(events, first_ns, (32, 24), "error"))
+                stamps, poses = bag.image_stamps_ns(images), bag.poses("/optitrack/davis_stereo")
+                shapes = {image.shape for _, image in bag.images(images)}
+            outcomes.add((count, len(stamps), len(poses or ()), len(shapes)))
+        except InputError as error:
+            assert "desk_test.bag" in str(error)
+            outcomes.add(None)
+    assert {None, (200, 4, 6, 1)} <= outcomes
 
 
 def test_bags_of_silent_cameras(tmp_path: Path) -> None:

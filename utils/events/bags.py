@@ -212,8 +212,9 @@ class BagEventReader(SequentialReader):
 
 def _bag_reader_errors() -> tuple[type[Exception], ...]:
     from rosbags import rosbag1, rosbag2
+    from rosbags.serde import SerdeError
 
-    return rosbag1.ReaderError, rosbag2.ReaderError
+    return rosbag1.ReaderError, rosbag2.ReaderError, SerdeError
 
 
 def _storage_errors() -> tuple[type[Exception], ...]:

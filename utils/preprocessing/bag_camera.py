@@ -1,4 +1,4 @@
-"""One camera of a stereo bag (ROS 1): events, images, tracked poses and camera info as plain arrays, without ROS."""
+"""One camera of a stereo bag (ROS 1): events, images and tracked poses as plain arrays, without ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from utils.trajectory_io import Trajectory
 Image = npt.NDArray[np.uint8]
 _IMAGES = ("sensor_msgs/msg/Image",)
 _POSES = ("geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
-_CAMERA_INFO = ("sensor_msgs/msg/CameraInfo",)
 _CHANNELS = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3}
 _EVENTS_PER_BLOCK = 1 << 18
 
@@ -121,17 +120,6 @@ class BagCamera:
             return Trajectory(stamps[kept], np.array([row for _, row in rows], np.float64)[kept])
         except InputError as error:
             raise InputError(f"{self.path}: topic {topic}: {str(error).replace(' us', ' ns')}") from None
-
-    def camera_matrix(self, topic: str) -> tuple[tuple[int, int], tuple[float, float, float, float]]:
-        """Return ((width, height), (fx, fy, cx, cy)) of the first camera info.
-
-        Raises:
-            InputError: there is none.
-        """
-        for message in self._messages(topic, _CAMERA_INFO):
-            K = [float(value) for value in message.K]
-            return (int(message.width), int(message.height)), (K[0], K[4], K[2], K[5])
-        raise InputError(f"{self.path}: topic {topic} holds no camera info")
 
     def first_event_ns(self, topic: str, order: Order) -> int:
         """Return the stamp of the first event; "sort" looks through all events for the earliest.

@@ -20,6 +20,7 @@ from utils.preprocessing.bag_camera import BagCamera, EventBlock, Topics
 from utils.preprocessing.poses import times_transform
 from utils.preprocessing.products import Image, Products
 from utils.preprocessing.registry import PreprocessOptions
+from utils.ros_output.camera_info import read_camera_info
 from utils.undistort import ImageUndistorter
 
 
@@ -55,8 +56,8 @@ def run_bag(recipe: BagRecipe, options: PreprocessOptions) -> list[Path]:
         calibration = recipe.calibration
         if calibration is None:
             assert topics.camera_info is not None
-            (width, height), (fx, fy, cx, cy) = bag.camera_matrix(topics.camera_info)
-            calibration = Calibration(width, height, fx, fy, cx, cy)
+            info = read_camera_info(bag.path, topics.camera_info)
+            calibration = Calibration(info.width, info.height, *info.intrinsics.tolist())
         _write_clocked(bag, topics, calibration, recipe, products)
         intrinsics = products.pinhole(files.pinhole, calibration)
         if calibration.is_distorted:

@@ -82,9 +82,9 @@ def header(store: Any, t_us: int) -> Any:
     return types["std_msgs/msg/Header"](seq=1, stamp=stamp, frame_id="cam")
 
 
-def write_bag(path: Path, store: Any, entries: list[Entry]) -> Path:
+def write_bag(path: Path, store: Any, entries: list[Entry], compression: str | None = "lz4") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with bag_samples.open_writer(path, 1, "lz4", "") as writer:
+    with bag_samples.open_writer(path, 1, compression, "") as writer:
         connections: dict[str, Any] = {}
         for received, topic, kind, data in sorted(entries, key=lambda entry: entry[0]):
             if topic not in connections:
