@@ -73,5 +73,5 @@ def _calibration(message: Any) -> Calibration:
     if D[count:].any():
         raise InputError(f"the model {message.distortion_model} has {np.count_nonzero(D)} coefficients, only the first "
                          f"{count} can be used")
-    return Calibration(int(message.width), int(message.height), *K[[0, 4, 2, 5]].tolist(), model,
-                       tuple(D[:count].tolist()))
+    fx, fy, cx, cy = (float(K[index]) for index in (0, 4, 2, 5))
+    return Calibration(int(message.width), int(message.height), fx, fy, cx, cy, model, tuple(D[:count].tolist()))
