@@ -176,6 +176,8 @@ class _Recorders:
         self.map.on_frame(tracker)
         if self.edges is not None:
             self.edges.on_frame(tracker)
+        if self.options.viz_flow:
+            tracker.flow_data.get(tracker.counter - 1, {}).pop("img", None)  # not written, but megabytes per frame
         if self.options.debug:
             explained = "not initialised" if not tracker.tracked else "explained" if tracker.tracked[-1] else "lost"
             say(f"frame {tracker.counter - 1} at {tracker.tlist[-1]:.0f} us: {tracker.n} keyframes, {tracker.m} "
@@ -245,8 +247,7 @@ def _write_edges(products: Products, record: ExportRecord, product: str, cloud: 
 
 def _save_flow(products: Products, flowdata: dict[int, dict[str, Any]]) -> Path:
     """`<base>_flow.npz`: per frame `{frame}_{ii,jj,kk,coords_est,n}`; arrays only, no pickle."""
-    arrays = {f"{frame}_{key}": np.asarray(value) for frame, entry in flowdata.items()
-              for key, value in entry.items() if key != "img"}
+    arrays = {f"{frame}_{key}": np.asarray(value) for frame, entry in flowdata.items() for key, value in entry.items()}
     return save_arrays(products.path("_flow.npz"), arrays, compressed=True)
 
 

@@ -93,6 +93,8 @@ def test_all_products(export: Callable[..., dict], scene: OracleScene, tmp_path:
     assert float(distance.median()) < 0.1, "the walls are about 3 away"
     check_frames(out, meta)
     check_frame_clouds(tmp_path / "clouds", meta)
+    with np.load(out / "run_flow.npz") as flow:
+        assert {name.split("_", 1)[1] for name in flow.files} == {"ii", "jj", "kk", "coords_est", "n"}
     points = np.load(out / "run_dpviewer.npy")
     assert len(points) >= meta["point_cloud_shape"][0]
     check_stand_alone(tmp_path, meta)
