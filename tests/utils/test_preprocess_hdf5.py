@@ -263,3 +263,16 @@ def test_the_same_calibration_in_another_folder(tmp_path: Path, recording: RawRe
     preprocess("tumvie", folder, images=OFF)
     fx = json.loads((folder / "calibration.json").read_text())["value0"]["intrinsics"][0]["intrinsics"]["fx"]
     assert fx == TUMVIE_CAMERAS[0].fx - 40
+
+
+@pytest.mark.parametrize("linked", ["sequence", "calibrations"])
+def test_links(linked: str, recording: RawRecording, tmp_path: Path) -> None:
+    """A sequence may be a link to another disk, with the calibrations beside the link or beside its target."""
+    store, here = tmp_path / "store", tmp_path / "here"
+    here.mkdir()
+    folder = write_vector(store, recording, frames=False)
+    (here / folder.name).symlink_to(folder)
+    if linked == "calibrations":
+        (store / "0_calib").rename(here / "0_calib")
+    assert preprocess("vector", here, images=OFF)[here / folder.name]
+    assert open_sequence("vector", here / folder.name).ground_truth() is not None

@@ -90,6 +90,12 @@ def walk_folders(root: Path, is_sequence: Callable[[Path], bool]) -> list[Path]:
     return sorted(_walk(root, is_sequence, set())) if root.is_dir() else []
 
 
+def folders_around(folder: Path) -> list[Path]:
+    """Return the folder that holds `folder` as it was named and, if that is another one, as links lead to it."""
+    named = Path(os.path.abspath(folder)).parent  # noqa: PTH100 - normalises `..` without following links
+    return list(dict.fromkeys((named, folder.resolve().parent)))
+
+
 def _walk(folder: Path, is_sequence: Callable[[Path], bool], seen: set[str]) -> Iterator[Path]:
     real = os.path.realpath(folder)
     if real in seen:

@@ -24,7 +24,7 @@ from utils.datasets.tumvie import (
 )
 from utils.preprocessing.image_lists import counted_images, undistort_files
 from utils.preprocessing.products import Products
-from utils.preprocessing.registry import PreprocessOptions, Preprocessor, register, walk_folders
+from utils.preprocessing.registry import PreprocessOptions, Preprocessor, folders_around, register, walk_folders
 from utils.sequence_names import find_in_path
 from utils.undistort import undistorted_intrinsics
 
@@ -61,7 +61,7 @@ def find_calibration(folder: Path) -> Path:
     """
     letter = "A" if find_in_path(folder, _CALIBRATION_A) else "B"
     name = f"camera-calibration{letter}.json"
-    for candidate in (folder.resolve().parent / name, folder / name, folder / RAW_CALIBRATION):
+    for candidate in (*(holder / name for holder in folders_around(folder)), folder / name, folder / RAW_CALIBRATION):
         if candidate.is_file():
             return candidate
     raise InputError(f"{folder}: no calibration; put {name} of TUM-VIE beside the sequence")

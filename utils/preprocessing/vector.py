@@ -15,7 +15,7 @@ from utils.datasets.vector import EVENT_SIZE, FRAME_SIZE, event_file_suffix, seq
 from utils.preprocessing.image_lists import counted_images, undistort_files
 from utils.preprocessing.poses import inverse, rigid, times_transform
 from utils.preprocessing.products import Products
-from utils.preprocessing.registry import PreprocessOptions, Preprocessor, register, walk_folders
+from utils.preprocessing.registry import PreprocessOptions, Preprocessor, folders_around, register, walk_folders
 from utils.trajectory_io import read_tum
 
 CALIBRATION_FOLDER = "0_calib"
@@ -58,9 +58,9 @@ def find_calibrations(folder: Path) -> Path:
     Raises:
         InputError: there is none.
     """
-    for candidate in (folder.resolve().parent / CALIBRATION_FOLDER, folder / CALIBRATION_FOLDER):
-        if candidate.is_dir():
-            return candidate
+    for holder in (*folders_around(folder), folder):
+        if (holder / CALIBRATION_FOLDER).is_dir():
+            return holder / CALIBRATION_FOLDER
     raise InputError(f"{folder}: no calibrations; put the folder {CALIBRATION_FOLDER} of VECtor beside the sequence")
 
 
