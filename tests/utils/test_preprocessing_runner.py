@@ -168,6 +168,13 @@ def test_a_camera_that_exists_decides_about_the_map(tmp_path: Path) -> None:
         assert np.array_equal(stream["rectify_map"][()], rectify_map(CAMERA, intrinsics=[25, 26, 15, 12])[0])
     anew = Products(PreprocessOptions(overwrite=True)).pinhole(tmp_path / "calib.txt", CAMERA)
     assert anew.tolist() != intrinsics.tolist()
+    (tmp_path / "calib.txt").unlink()
+    again = Products(PreprocessOptions())
+    new = again.pinhole(tmp_path / "calib.txt", CAMERA)
+    again.map(tmp_path / "map.h5", CAMERA, new)
+    assert [path.name for path in again.made] == ["calib.txt", "map.h5"], "the map of the lost camera is of no use"
+    with h5py.File(tmp_path / "map.h5") as stream:
+        assert np.array_equal(stream["rectify_map"][()], rectify_map(CAMERA)[0])
     (tmp_path / "calib.txt").write_text("25.0 nan 15.0 12.0")
     with pytest.raises(InputError, match="fy is nan"):
         products.pinhole(tmp_path / "calib.txt", CAMERA)

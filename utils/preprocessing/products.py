@@ -36,11 +36,13 @@ class Products:
 
     Attributes:
         made: the files and folders made so far.
+        has_new_camera: an undistorted camera was made, so maps and images of an earlier one are made again.
     """
 
     def __init__(self, options: PreprocessOptions) -> None:
         self.options = options
         self.made: list[Path] = []
+        self.has_new_camera = False
 
     def missing(self, *paths: Path) -> bool:
         """Whether any of these has to be made."""
@@ -81,11 +83,12 @@ class Products:
             return read_calibration(path, image_size=(calibration.width, calibration.height)).intrinsics
         intrinsics = undistorted_intrinsics(calibration, balance=balance)
         self.text(path, pinhole_text(intrinsics))
+        self.has_new_camera = True
         return intrinsics
 
     def map(self, path: Path, calibration: Calibration, intrinsics: npt.ArrayLike) -> None:
-        """Make the rectification map of the events, if it is missing."""
-        if self.missing(path):
+        """Make the rectification map of the events, if it is missing or belongs to an earlier camera."""
+        if self.missing(path) or self.has_new_camera:
             write_rectify_map(path, rectify_map(calibration, intrinsics=intrinsics)[0])
             self.made.append(path)
 
@@ -102,7 +105,8 @@ class Products:
         """
         from tqdm import tqdm
 
-        if not self.options.images or not (self.options.overwrite or _count_images(folder) != count):
+        is_complete = _count_images(folder) == count and not self.has_new_camera and not self.options.overwrite
+        if is_complete or not self.options.images:
             return
         bar = tqdm(images(), total=count, unit="image", desc=folder.name, leave=False,
                    disable=not self.options.progress)
