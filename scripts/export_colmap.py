@@ -76,6 +76,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _track_recording(args: argparse.Namespace) -> str:
+    from devo.errors import InputError
+
+    if not Path(args.datapath).exists():
+        raise InputError(f"--datapath {args.datapath} does not exist, expected a recording")
     from utils.export_options import ExportOptions
     from utils.export_run import export_pointcloud
 
