@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from scripts.start_pipline import main
 from tests.scripts.export_stand_in import FRAMES, POINTS, StandIn
 from utils.clouds.io import read_cloud
 from utils.pipeline import stages
+from utils.preprocessing import PREPROCESSORS, PreprocessOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "scripts" / "start_pipline.py"
@@ -251,6 +253,27 @@ def test_warnings_are_told(call: Callable, export: StandIn, recording: Path) -> 
     assert Path("results/walk/pointcloud_view.html").is_file()  # of the raw cloud
 
 
+def test_preprocessing_anew(call: Callable, export: StandIn, recording: Path, tmp_path: Path,
+                            monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a recording that was preprocessed before; recordings of one's own have nothing to preprocess."""
+    folder = tmp_path / "prepared"
+    folder.mkdir()
+    for name in ("events.txt", "t_offset_us.txt", "images_timestamps_us.txt", "calib_undist.txt", "rectify_map.h5"):
+        (folder / name).touch()
+    asked: list[PreprocessOptions] = []
+
+    def run(_: Path, options: PreprocessOptions) -> list[Path]:
+        asked.append(options)
+        return []
+
+    monkeypatch.setitem(PREPROCESSORS, "fpv", replace(PREPROCESSORS["fpv"], run=run))
+    for words in ((), ("--overwrite-preprocessing",), ("--", "--rgb")):
+        assert call(folder, *words).returncode == 0
+    assert [(options.overwrite, options.images) for options in asked] == [(True, False), (False, True)]
+    assert call(recording, "--overwrite-preprocessing").returncode == 0
+    assert statuses(Path("results/walk"))["preprocess"] == "skipped"
+
+
 def test_names_of_products(call: Callable, export: StandIn, recording: Path) -> None:
     assert call(recording, "--outdir", "here", "--outname", "board.ply", "--frame-out", "f.npz", "--cleanup-output",
                 "clean/best.ply", "--no-view", "--export-side", "left").returncode == 0
@@ -319,3 +342,16 @@ def test_help_is_instant_and_loads_no_torch() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
     assert done.returncode == 0, done.stderr
     assert "--run-emvs" in done.stdout
+
+
+def test_as_a_process_from_another_folder(recording: Path, tmp_path: Path) -> None:
+    """Random events cannot be tracked: the run says so, exits with 1 and leaves its record."""
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), "data/walk/", "--weights", "random:0:16,16,8", "--", "--opts",
+         "PATCHES_PER_FRAME", "8"], capture_output=True, text=True, timeout=300, cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    assert done.stdout.splitlines()[0] == "walk: no trajectory and no cloud"
+    assert "export failed: not initialised" in done.stdout
+    record = json.loads((tmp_path / "results" / "walk" / "pipeline.json").read_text())
+    assert record["status"] == "failed" and record["working_directory"] == str(tmp_path)

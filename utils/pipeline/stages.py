@@ -20,6 +20,7 @@ from utils.export_run import ExportOptions, export_pointcloud, find_config, find
 from utils.pipeline.options import PipelineOptions
 from utils.pipeline.runner import Stage, StageResult
 from utils.pipeline.summary import cleaning_warnings, tracking_warnings
+from utils.preprocessing import PREPROCESSORS, PreprocessOptions
 
 _EDGE_CLOUDS = ("_edges", "_focus_edges")
 _CLOUDS = ("", *_EDGE_CLOUDS, "_dpviewer")
@@ -95,14 +96,12 @@ class Plan:
         found, overwrite = self.found, self.options.overwrite_preprocessing
         settings = {"dataset": found.dataset, "side": found.side, "images": self.export.rgb, "version": __version__}
         skip = ""
-        if found.ready and not overwrite:
-            skip = "recordings of your own need none" if found.dataset == "generic" else "its products are there"
+        if found.dataset not in PREPROCESSORS:
+            skip = f"recordings of data set {found.dataset} need none"
+        elif found.ready and not overwrite and not self.export.rgb:  # --rgb: are the images there, too?
+            skip = "its products are there"
 
         def run() -> StageResult:
-            from utils.preprocessing import PREPROCESSORS, PreprocessOptions
-
-            if found.dataset not in PREPROCESSORS:
-                raise InputError(f"there is no preprocessing for data set {found.dataset}")
             made = PREPROCESSORS[found.dataset].run(found.path, PreprocessOptions(
                 side=found.side, overwrite=overwrite, images=self.export.rgb, progress=True))
             return StageResult([path for path in made if path.is_file()], {"made": len(made)})
