@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,10 +11,11 @@ def find_in_path(path: Path, parts: Iterable[str]) -> str | None:
     """Return the first of `parts` that the name of the folder contains, else that one of its parents contains.
 
     Upper and lower case are not told apart. Inner folders come first, so that the name of a collection does not
-    decide about a sequence in it.
+    decide about a sequence in it; names of links come before those of what they lead to.
     """
     parts = list(parts)
-    for name in reversed(path.resolve().parts):
+    named = Path(os.path.abspath(path))  # noqa: PTH100 - normalises `..` without following links
+    for name in (*reversed(named.parts), *reversed(path.resolve().parts)):
         for part in parts:
             if part.lower() in name.lower():
                 return part

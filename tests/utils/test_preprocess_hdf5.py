@@ -26,7 +26,6 @@ from tests.utils.raw_layouts.hdf5_folders import (
     write_eds,
     write_mvsec,
     write_tumvie,
-    write_tumvie_calibration,
     write_vector,
 )
 from tests.utils.raw_layouts.recording import RawRecording
@@ -35,6 +34,7 @@ from utils.datasets.eds import CAMERAS as EDS_CAMERAS
 from utils.datasets.registry import SequenceOptions, open_sequence
 from utils.preprocessing import preprocess
 from utils.preprocessing.poses import times_transform
+from utils.preprocessing.tumvie import find_calibration
 from utils.trajectory_io import read_tum
 from utils.undistort import read_rectify_map, rectify_map, undistorted_intrinsics
 
@@ -254,15 +254,17 @@ def test_images_that_do_not_fit_their_stamps(dataset: str, recording: RawRecordi
         preprocess(dataset, tmp_path)
 
 
-def test_the_same_calibration_in_another_folder(tmp_path: Path, recording: RawRecording) -> None:
-    """What is asked of the name is asked of the sequence's own folder first, not of the collection around it."""
+def test_only_the_names_of_a_sequence_choose_its_calibration(tmp_path: Path, recording: RawRecording) -> None:
+    """Names of the folder, of a link to it, or of its event file; not those of the folders around it."""
     root = tmp_path / "mocap-desk-and-others"
     root.mkdir()
-    folder = write_tumvie(root, recording, name="skate-easy", frames=False)
-    write_tumvie_calibration(root / "camera-calibrationB.json", 5.0)
-    preprocess("tumvie", folder, images=OFF)
-    fx = json.loads((folder / "calibration.json").read_text())["value0"]["intrinsics"][0]["intrinsics"]["fx"]
-    assert fx == TUMVIE_CAMERAS[0].fx - 40
+    for name, letter in (("mocap-6dof", "B"), ("skate-easy", "A")):
+        folder = write_tumvie(root, recording, name=name, frames=False)
+        event_file = next(folder.glob("*events_left.h5")).name
+        assert find_calibration(folder, event_file).name == f"camera-calibration{letter}.json"
+    (root / "loop-floor1").symlink_to(root / "mocap-6dof")
+    assert find_calibration(root / "loop-floor1", "events_left.h5").name == "camera-calibrationA.json"
+    assert find_calibration(root / "mocap-6dof", "mocap-desk2-events_left.h5").name == "camera-calibrationA.json"
 
 
 @pytest.mark.parametrize("linked", ["sequence", "calibrations"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -25,23 +26,22 @@ from utils.datasets.tumvie import (
 from utils.preprocessing.image_lists import counted_images, undistort_files
 from utils.preprocessing.products import Products
 from utils.preprocessing.registry import PreprocessOptions, Preprocessor, folders_around, register, walk_folders
-from utils.sequence_names import find_in_path
 from utils.undistort import undistorted_intrinsics
 
 RAW_CALIBRATION = "calibration.json"
-_CALIBRATION_A = ("loop-floor", "mocap-desk", "mocap-desk2", "skate-easy")
+_CALIBRATION_A = ("loop-floor", "mocap-desk", "skate-easy")  # mocap-desk2 included
 
 
 def run(folder: Path, options: PreprocessOptions) -> list[Path]:
     """Make calibrations, rectification map and images of one side of a sequence; the clock stays as it is."""
     products, side = Products(options), options.side
-    only_match(folder, event_pattern(side), f"event file of the {side} camera of TUM-VIE")
+    events = only_match(folder, event_pattern(side), f"event file of the {side} camera of TUM-VIE")
     source, target = folder / f"{side}_images", folder / f"{side}_images_undistorted"
     stamps = source / f"image_timestamps_{side}.txt"
     count = len(read_stamps(stamps))
     raw, undistorted = folder / RAW_CALIBRATION, folder / CALIBRATION_FILE
     if products.missing(raw, undistorted):
-        _make_calibrations(products, raw, undistorted, find_calibration(folder))
+        _make_calibrations(products, raw, undistorted, find_calibration(folder, events.name))
     products.map(folder / f"rectify_map_{side}.h5", read_camera(undistorted, CAMERAS[side]),
                  read_undistorted(undistorted, CAMERAS[side]))
     if options.images:
@@ -53,13 +53,16 @@ def run(folder: Path, options: PreprocessOptions) -> list[Path]:
     return products.made
 
 
-def find_calibration(folder: Path) -> Path:
+def find_calibration(folder: Path, event_file: str) -> Path:
     """Return the calibration of a sequence: `camera-calibration{A,B}.json` beside it, else the copy in it.
+
+    The names of the folder and of its event file decide which; those of the folders around it do not.
 
     Raises:
         InputError: there is none.
     """
-    letter = "A" if find_in_path(folder, _CALIBRATION_A) else "B"
+    names = (event_file, Path(os.path.abspath(folder)).name, folder.resolve().name)  # noqa: PTH100 - keeps links
+    letter = "A" if any(part in name for part in _CALIBRATION_A for name in names) else "B"
     name = f"camera-calibration{letter}.json"
     for candidate in (*(holder / name for holder in folders_around(folder)), folder / name, folder / RAW_CALIBRATION):
         if candidate.is_file():
