@@ -12,7 +12,9 @@
   const RED = [1, 0.435, 0.38], GREEN = "#7ee787";
   const low = DATA.low, high = DATA.high, diagonal = norm(sub(high, low));
   const state = { target: [0, 0, 0], yaw: 0, pitch: 0, distance: 1, frame: Math.max(frames.count - 1, 0), playing: 0 };
-  const HALF_ANGLE = 0.36;
+  const HALF_ANGLE = 0.36, STEEPEST = Math.PI / 2 - 1e-4;
+  const VIEWS = { perspective: [0.464, 0.35], top: [0, STEEPEST], side: [-Math.PI / 2, 0], front: [0, 0] };
+  const wishes = location.hash.slice(1).split(",");  // for example #top or #canvas,side
   let renderer, matrix;
 
   // --- the camera that looks at the scene -----------------------------------------------------------------
@@ -24,8 +26,7 @@
   }
 
   function setView(name) {
-    const half = 1e-4 - Math.PI / 2;
-    [state.yaw, state.pitch] = { perspective: [0.464, 0.35], top: [0, -half], side: [Math.PI / 2, 0], front: [0, 0] }[name];
+    [state.yaw, state.pitch] = VIEWS[name];
     state.target = [0, 1, 2].map((i) => (low[i] + high[i]) / 2);
     for (let round = 0; round < 4; round++) fit();
     request();
@@ -199,7 +200,7 @@
     } else if (before.pan) pan(...delta);
     else {
       state.yaw += delta[0] * 0.006;
-      state.pitch = Math.min(Math.max(state.pitch + delta[1] * 0.006, 1e-4 - Math.PI / 2), Math.PI / 2 - 1e-4);
+      state.pitch = Math.min(Math.max(state.pitch + delta[1] * 0.006, -STEEPEST), STEEPEST);
     }
     pointers.set(event.pointerId, { ...before, x: event.clientX, y: event.clientY });
     request();
@@ -281,7 +282,7 @@
 
   function start() {
     try {
-      if (location.hash === "#canvas") throw new Error("canvas asked for");
+      if (wishes.includes("canvas")) throw new Error("canvas asked for");
       renderer = new WebGlRenderer(view);
     } catch {
       const fresh = view.cloneNode();  // a canvas that was tried with WebGL gives no other context
@@ -295,7 +296,7 @@
     fillPage();
     recolor();
     connect();
-    setView("perspective");
+    setView(wishes.find((name) => name in VIEWS) || "perspective");
     showFrame(state.frame);
     if (!frames.count) $("frame-text").textContent = "";
   }
