@@ -24,6 +24,7 @@ from utils.datasets.prepared import (
     require_files,
     stamp_windows,
 )
+from utils.datasets.recognise import preprocessing_command
 from utils.datasets.registry import register
 from utils.datasets.sequence import Frame, Sequence
 from utils.events.reader import EventReader, open_events
@@ -92,7 +93,7 @@ def open_eds(path: Path, options: SequenceOptions, voxel_size: tuple[int, int] |
     if calib1 is None:
         calib1 = not (path / "rectify_map_calib0.h5").is_file() and (path / "rectify_map_calib1.h5").is_file()
     calibration = CALIBRATIONS[calib1]
-    command = f"python scripts/pp_eds.py --indir {path}" + (" --calib1" if calib1 else "")
+    command = preprocessing_command("eds", path, "left")
     events = only_match(path, "events.h5", "event file of EDS")
     files = {"events": events, "image stamps": path / STAMPS_FILE,
              "rectify map": path / f"rectify_map_{calibration}.h5"}

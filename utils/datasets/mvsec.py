@@ -21,6 +21,7 @@ from utils.datasets.prepared import (
     refuse_own_camera,
     require_files,
 )
+from utils.datasets.recognise import preprocessing_command
 from utils.datasets.registry import register
 from utils.datasets.sequence import Frame, GroundTruth, Sequence
 from utils.events.hdf5 import hdf5_errors, open_hdf5
@@ -64,7 +65,7 @@ def open_mvsec(path: Path, options: SequenceOptions, voxel_size: tuple[int, int]
         refuse_options(options, "mvsec", "on_unsorted", because="its windows count events in the order of the file")
     side = options.side
     data = only_match(path, f"*{DATA_SUFFIX}", "recording of MVSEC; pass the folder that pp_mvsec.py makes")
-    command = f"python scripts/pp_mvsec.py --indir {path.absolute().parent} --side {side}"
+    command = preprocessing_command("mvsec", path.absolute().parent, side)
     files = {"events": data, "image stamps": path / f"tss_imgs_us_{side}.txt",
              "intrinsics": path / f"calib_undist_{side}.txt", "rectify map": path / f"rectify_map_{side}.h5"}
     require_files(path, [file.name for file in files.values()], command)

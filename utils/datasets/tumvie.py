@@ -24,6 +24,7 @@ from utils.datasets.prepared import (
     require_files,
     stamp_windows,
 )
+from utils.datasets.recognise import preprocessing_command
 from utils.datasets.registry import register
 from utils.datasets.sequence import Frame, Sequence
 from utils.events.reader import EventReader, open_events
@@ -68,7 +69,7 @@ def open_tumvie(path: Path, options: SequenceOptions, voxel_size: tuple[int, int
     refuse_own_camera(options, "tumvie")
     side = options.side
     events = only_match(path, event_pattern(side), f"event file of the {side} camera of TUM-VIE")
-    command = f"python scripts/pp_tumvie.py --indir {path} --side {side}"
+    command = preprocessing_command("tumvie", path, side)
     images = path / f"{side}_images_undistorted"
     files = {"events": events, "image stamps": images / f"image_timestamps_{side}.txt",
              "intrinsics": path / CALIBRATION_FILE, "rectify map": path / f"rectify_map_{side}.h5"}

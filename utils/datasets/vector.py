@@ -20,6 +20,7 @@ from utils.datasets.prepared import (
     require_files,
     stamp_windows,
 )
+from utils.datasets.recognise import preprocessing_command
 from utils.datasets.registry import register
 from utils.datasets.sequence import Frame, Sequence
 from utils.events.reader import EventReader, open_events
@@ -92,7 +93,7 @@ def open_vector(path: Path, options: SequenceOptions, voxel_size: tuple[int, int
     side = options.side
     event_file = only_match(path, f"*{event_file_suffix(side)}", f"event file of the {side} camera of VECtor")
     name = sequence_name(event_file, side)
-    command = f"python scripts/pp_vector.py --indir {path} --side {side}"
+    command = preprocessing_command("vector", path, side)
     files = {"events": event_file, "image stamps": path / f"tss_imgs_us_{side}.txt",
              "intrinsics": path / f"calib_undist_evs_{side}.txt", "rectify map": path / f"rectify_map_{side}.h5"}
     require_files(path, [file.name for file in files.values()], command)
