@@ -4,7 +4,7 @@
 Example: python evals/validate_pointcloud.py --sequence datasets/board
 
 Needs a recording with ground truth: a simulated one (python scripts/simulate.py --scene board --out datasets/board
---seconds 8 --seed 1), a generic folder with groundtruth.txt, or a preprocessed folder of VECtor (--dataset vector).
+--seconds 8 --seed 1), a generic folder with groundtruth.txt, or a preprocessed sequence, for example of VECtor.
 Open validation.html in the report folder. Trials of the odometry are kept there and reused by the next run.
 """
 
@@ -24,7 +24,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--sequence", type=Path, default=Path("datasets/board"), help="folder of the recording (default: %(default)s)")
-    add("--dataset", default="generic", help="how to read it (default: %(default)s)")
+    add("--dataset", default="auto", help="how to read it (default: recognised by its files)")
     add("--side", default="left", help="camera of a stereo recording (default: %(default)s)")
     add("--out", type=Path, help="report folder (default: results/validation_<name of the sequence>)")
     add("--weights", help="checkpoint or name of built-in weights (default: the built-in ones)")

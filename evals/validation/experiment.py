@@ -160,6 +160,7 @@ def validate(settings: ValidationSettings) -> Validation:
         TrackingError: the odometry gave nothing usable.
     """
     clock = _Clock()
+    settings = settings.resolved()
     source = open_source(settings)
     trials = run_trials(settings)
     clock.stop("odometry")
@@ -177,36 +178,38 @@ def validate(settings: ValidationSettings) -> Validation:
     raw = trial.raw.select(trial.raw.finite_mask())
     points = {EMVS_TRUE: maps["gt"].points, EMVS_DEVO: maps["devo"].points,
               CLEANED: alignment.metric_T_devo.apply(cloud.points), RAW: alignment.metric_T_devo.apply(raw.points)}
-    track = PoseTrack(source.truth)
     distance = float(np.median(maps["gt"].view.cloud.points[:, 2])) if len(points[EMVS_TRUE]) else float("nan")
-    limits = thresholds_m(distance, alignment.units_per_m)
-    agreements = [compare(pair_name(first, second), points[first], points[second], limits, JUDGED_SHARE * distance)
-                  for first, second in ((EMVS_DEVO, CLEANED), (EMVS_TRUE, CLEANED), (EMVS_TRUE, RAW),
-                                        (EMVS_TRUE, EMVS_DEVO))]
+    agreements = _compare_all(points, distance, alignment)
     planes = {name: planarity(name, found, distance) for name, found in points.items()}
+    track = PoseTrack(source.truth)
     plane = planes[EMVS_TRUE].robust if source.depth is None else true_plane(
         source.depth, track, setup.reference_us, 0.01 * distance)
+    seen_us = {EMVS_TRUE: setup.reference_us, EMVS_DEVO: setup.reference_us, CLEANED: cloud.scalars["t_us"],
+               RAW: raw.scalars["t_us"]}
     depth = {} if source.depth is None else {
-        name: judge_depth(points[name], t_us, source.depth, track).summary for name, t_us in (
-            (EMVS_TRUE, setup.reference_us), (EMVS_DEVO, setup.reference_us), (CLEANED, cloud.scalars["t_us"]),
-            (RAW, raw.scalars["t_us"]))}
+        name: judge_depth(points[name], t_us, source.depth, track).summary for name, t_us in seen_us.items()}
     clock.stop("comparisons")
     summaries = [_summarise(other, source, points[EMVS_TRUE], distance, track) for other in trials]
     clock.stop("other trials")
     picture = source.picture(setup.reference_us)
     projections = {name: _project(name, points[name], picture, alignment, trial, track)
                    for name in (EMVS_TRUE, EMVS_DEVO, CLEANED)}
-    notes = list(source.notes)
-    edges = {}
-    for name, found in projections.items():
-        if found.inside.any() and picture.edges.any():
-            edges[name] = edge_agreement(found.pixel_xy[found.inside], picture.edges)
-        else:
-            notes.append(f"{name}: no point falls into the picture ({picture.kind}), so edges are not compared.")
+    edges = {name: edge_agreement(found.pixel_xy[found.inside], picture.edges)
+             for name, found in projections.items() if found.inside.any() and picture.edges.any()}
+    notes = [*source.notes, *(f"{name}: no point falls into the picture ({picture.kind}), so edges are not compared."
+                              for name in projections if name not in edges)]
     clock.stop("image")
     return Validation(
         settings, source, trial, alignment, cloud, cleaning, summaries, setup, maps, distance, points, agreements,
         planes, plane, source.depth is not None, depth, picture, projections, edges, clock.seconds, notes)
+
+
+def _compare_all(points: dict[str, FloatArray], distance_m: float, alignment: Alignment) -> list[Agreement]:
+    """The maps against the exported cloud, and against each other."""
+    limits = thresholds_m(distance_m, alignment.units_per_m)
+    pairs = ((EMVS_DEVO, CLEANED), (EMVS_TRUE, CLEANED), (EMVS_TRUE, RAW), (EMVS_TRUE, EMVS_DEVO))
+    return [compare(pair_name(first, second), points[first], points[second], limits, JUDGED_SHARE * distance_m)
+            for first, second in pairs]
 
 
 def _summarise(trial: Trial, source: Source, reference: FloatArray, distance_m: float,

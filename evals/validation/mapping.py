@@ -181,13 +181,15 @@ def make_setup(settings: ValidationSettings, source: Source, estimate: Trajector
                sparse_points: FloatArray) -> MapSetup:
     """Common span, depth range from the cloud of the odometry as the reference view sees it, EMVS settings.
 
+    The span begins and ends with a pose of the odometry inside the ground truth, so that it holds for every variant.
+
     Raises:
         InputError: events, true poses and odometry share no time.
     """
     with source.sequence.open_events() as reader:
         first, last = reader.time_range_us()
-    start = max(float(first), float(source.truth.t_us[0]), float(estimate.t_us[0]))
-    stop = min(float(last), float(source.truth.t_us[-1]), float(estimate.t_us[-1]))
+    known = estimate.t_us[(estimate.t_us >= source.truth.t_us[0]) & (estimate.t_us <= source.truth.t_us[-1])]
+    start, stop = max(float(first), float(known[0])), min(float(last), float(known[-1]))
     if not start < stop:
         raise InputError(f"events ({first} us to {last} us), ground truth ({source.truth.t_us[0]:.0f} us to "
                          f"{source.truth.t_us[-1]:.0f} us) and odometry ({estimate.t_us[0]:.0f} us to "

@@ -92,7 +92,8 @@ def run_trials(settings: ValidationSettings) -> list[Trial]:
             found[seed] = dataclasses.replace(trial, reused=False)
     trials = [found[seed] for seed in settings.seeds]
     if not trials[0].ok:
-        raise TrackingError(f"{settings.sequence}: seed {trials[0].seed}: {trials[0].facts['message']}")
+        raise TrackingError(f"{settings.sequence}: seed {trials[0].seed}: {trials[0].facts['message']}, or another "
+                            "--seed")
     return trials
 
 

@@ -9,6 +9,8 @@ from typing import Any
 
 from devo.errors import InputError
 from utils.datasets.options import SequenceOptions
+from utils.datasets.recognise import AUTO
+from utils.datasets.registry import locate_sequence
 from utils.emvs.settings import EmvsSettings
 
 THRESHOLDS_M = (0.01, 0.02, 0.05, 0.10)
@@ -37,7 +39,7 @@ class ValidationSettings:
 
     Attributes:
         sequence: folder of the recording; it needs ground truth.
-        dataset: how to read it, a name of `utils.datasets`.
+        dataset: how to read it, a name of `utils.datasets`; "auto" recognises it by its files.
         side: camera of a stereo recording.
         out: report folder.
         weights: checkpoint or name of built-in weights; None = the default ones.
@@ -60,7 +62,7 @@ class ValidationSettings:
 
     sequence: Path
     out: Path
-    dataset: str = "generic"
+    dataset: str = AUTO
     side: str = "left"
     weights: str | None = None
     config: str | None = None
@@ -92,6 +94,17 @@ class ValidationSettings:
     def seeds(self) -> tuple[int, ...]:
         """The seeds of all trials."""
         return tuple(range(self.seed, self.seed + self.trials))
+
+    def resolved(self) -> ValidationSettings:
+        """The same with the data set and the folder that "auto" stands for.
+
+        Raises:
+            InputError: the path is missing, or holds no sequence that is ready to be read.
+        """
+        if self.dataset != AUTO:
+            return self
+        found = locate_sequence(AUTO, self.sequence, self.sequence_options()).require_ready()
+        return dataclasses.replace(self, dataset=found.dataset, sequence=found.path)
 
     def sequence_options(self) -> SequenceOptions:
         """The part that concerns the recording."""

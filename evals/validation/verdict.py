@@ -46,7 +46,7 @@ def criteria(found: Validation, seconds: float) -> list[Criterion]:
 
     Args:
         found: the figures.
-        seconds: what the whole run took; reused odometry counts with the time it took when it was made.
+        seconds: what the run took up to the figures; not judged where odometry was reused.
     """
     return [*_map_criteria(found), *_scale_criteria(found), *_cloud_criteria(found), _plane_criterion(found),
             _duration(found, seconds)]

@@ -104,7 +104,7 @@ def test_the_notebook_runs_from_top_to_bottom(repository: Path, tmp_path: Path) 
     for cell in notebook.cells:
         if "parameters" in cell.metadata.get("tags", []):
             cell.source = (
-                f"sequence, dataset, out, seconds = {str(board)!r}, 'generic', {str(tmp_path / 'report')!r}, 1.2\n"
+                f"sequence, dataset, out, seconds = {str(board)!r}, 'auto', {str(tmp_path / 'report')!r}, 1.2\n"
                 "options = {'trials': 1, 'max_frames': 26, 'emvs_events': 100_000, 'view_scale': 1.2,\n"
                 "           'opts': ('PATCHES_PER_FRAME', '48')}")
     NotebookClient(notebook, timeout=900, kernel_name="python3").execute()
