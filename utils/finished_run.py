@@ -71,6 +71,26 @@ class FinishedRun:
             raise InputError(f"{path}: expected a JSON object, found {type(meta).__name__}")
         return meta
 
+    def camera(self) -> tuple[npt.NDArray[np.float64], tuple[int, int]] | None:
+        """`fx fy cx cy` of the undistorted image and its (width, height) in pixels; None if the run does not say it.
+
+        Raises:
+            InputError: values in the description that are no camera.
+        """
+        meta = self.meta()
+        found: list[Any] = [meta.get(key) for key in ("intrinsics_fx_fy_cx_cy", "W", "H")]
+        if any(value is None for value in found):
+            return None
+        try:
+            intrinsics, width, height = np.asarray(found[0], dtype=np.float64), int(found[1]), int(found[2])
+        except (TypeError, ValueError):
+            intrinsics, width, height = np.empty(0), 0, 0
+        if intrinsics.shape != (4,) or not np.isfinite(intrinsics).all() or intrinsics[:2].min() <= 0 or min(
+                width, height) < 1:
+            raise InputError(f"{self.file('_meta.json')}: intrinsics_fx_fy_cx_cy, W and H are {found}, which is no "
+                             "camera; export the run again")
+        return intrinsics, (width, height)
+
     def poses_file(self) -> Path | None:
         """The file of the camera poses, None if the run has none."""
         found = [self.file(ending) for ending in ("_poses.npy", "_trajectory.txt") if self.file(ending).is_file()]

@@ -96,3 +96,16 @@ def test_unusable_files_are_named(tmp_path: Path) -> None:
         read_camera_path(tmp_path / "lonely_poses.npy", "T_up")
     write_tum(tmp_path / "t.txt", Trajectory(T_US, POSES))
     assert FinishedRun.of(tmp_path / "t.txt").poses_file() is None
+
+
+@pytest.mark.parametrize("values", [{"W": "wide"}, {"intrinsics_fx_fy_cx_cy": [1, 2]}, {"H": 0},
+                                    {"intrinsics_fx_fy_cx_cy": [1, float("nan"), 0, 0]}])
+def test_cameras_in_the_description_are_checked(tmp_path: Path, values: dict) -> None:
+    good = {"intrinsics_fx_fy_cx_cy": [60, 61, 32, 24], "W": 64, "H": 48}
+    (tmp_path / "run_meta.json").write_text(json.dumps(good))
+    camera = FinishedRun(tmp_path / "run").camera()
+    assert camera is not None and camera[0].tolist() == [60, 61, 32, 24] and camera[1] == (64, 48)
+    (tmp_path / "run_meta.json").write_text(json.dumps(good | values))
+    with pytest.raises(InputError, match="no camera"):
+        FinishedRun(tmp_path / "run").camera()
+    assert FinishedRun(tmp_path / "other").camera() is None

@@ -65,16 +65,14 @@ def model_of_run(path: str, rules: TrackRules) -> ColmapModel:
         InputError: files are missing or do not fit together.
     """
     run = FinishedRun.of(path)
-    meta, poses_file = run.meta(), run.poses_file()
-    if poses_file is None or not meta.get("intrinsics_fx_fy_cx_cy"):
+    camera, poses_file = run.camera(), run.poses_file()
+    if poses_file is None or camera is None:
         raise InputError(f"{run.base}: no finished export there; expected {run.base.name}_meta.json and "
                          f"{run.base.name}_poses.npy of scripts/export_pointcloud.py")
     cloud = _raw_cloud(run)
     poses = read_camera_path(poses_file)
     observations = _observations(run, cloud, rules)
-    camera = np.asarray(meta["intrinsics_fx_fy_cx_cy"], dtype=np.float64)
-    return build_model(cloud, observations, poses, frame_names(len(poses)), camera, (int(meta["W"]), int(meta["H"])),
-                       rules)
+    return build_model(cloud, observations, poses, frame_names(len(poses)), *camera, rules)
 
 
 def model_of_folder(source: FolderInput, rules: TrackRules) -> ColmapModel:

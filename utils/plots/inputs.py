@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from devo.errors import InputError
 from utils.clouds.cloud import PointCloud
 from utils.clouds.filters import range_filter, voxel_downsample
 from utils.finished_run import FinishedRun, read_any_cloud, read_camera_path, read_trajectory
-from utils.plots.coloring import ARBITRARY
 from utils.plots.scene import FloatArray, camera_pyramid
 
 
@@ -83,17 +81,11 @@ def _pyramid(run: FinishedRun, args: argparse.Namespace) -> FloatArray | None:
     """The camera's shape: as given, else as the description of the run says."""
     if args.intrinsics is not None:
         return camera_pyramid(args.intrinsics, args.width, args.height)
-    meta = run.meta()
-    intrinsics, width, height = (meta.get(key) for key in ("intrinsics_fx_fy_cx_cy", "W", "H"))
-    if not intrinsics or not width or not height:
-        return None
-    return camera_pyramid(intrinsics, int(width), int(height))
+    camera = run.camera()
+    return None if camera is None else camera_pyramid(camera[0], *camera[1])
 
 
 def default_output(args: argparse.Namespace, ending: str) -> Path:
     """`<folder of the input>/<stem><ending>`."""
     source = Path(getattr(args, "cloud", None) or args.poses)
-    return Path(os.fspath(source.with_name(source.stem + ending)))
-
-
-__all__ = ["ARBITRARY", "Inputs", "default_output", "read_inputs"]
+    return source.with_name(source.stem + ending)
