@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from devo.errors import TrackingError
 from evals.image_metrics import DepthErrors, EdgeAgreement, Projection, edge_agreement, project
@@ -184,8 +185,9 @@ def validate(settings: ValidationSettings) -> Validation:
     track = PoseTrack(source.truth)
     plane = planes[EMVS_TRUE].robust if source.depth is None else true_plane(
         source.depth, track, setup.reference_us, 0.01 * distance)
-    seen_us = {EMVS_TRUE: setup.reference_us, EMVS_DEVO: setup.reference_us, CLEANED: cloud.scalars["t_us"],
-               RAW: raw.scalars["t_us"]}
+    seen_us: dict[str, npt.ArrayLike] = {
+        EMVS_TRUE: setup.reference_us, EMVS_DEVO: setup.reference_us, CLEANED: cloud.scalars["t_us"],
+        RAW: raw.scalars["t_us"]}
     depth = {} if source.depth is None else {
         name: judge_depth(points[name], t_us, source.depth, track).summary for name, t_us in seen_us.items()}
     clock.stop("comparisons")
