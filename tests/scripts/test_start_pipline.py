@@ -311,14 +311,16 @@ WRONG = {
     "bad depth range": (["{walk}", "--run-emvs", "--emvs-min-depth", "3", "--emvs-max-depth", "2"], "not below"),
     "results in the recording": (["{walk}", "--outdir", "{walk}"], "is the recording itself"),
     "results in a file": (["{walk}", "--outdir", "{walk}/calib.yaml"], "calib.yaml"),
+    "display without one": (["{walk}", "--display"], "no display here"),
     "page without page": (["{walk}", "--display", "--no-view"], "--no-view"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG, ids=lambda name: name.replace(" ", "-"))
 def test_wrong_arguments_are_one_line_and_exit_code_2(case: str, call: Callable, export: StandIn, recording: Path,
-                                                      tmp_path: Path) -> None:
+                                                      tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words, expected = WRONG[case]
+    monkeypatch.setattr("utils.viewer.window.has_display", lambda: False)
     done = call(*(word.format(walk=recording, tmp=tmp_path) for word in words))
     assert done.returncode == 2, done.stderr
     assert expected in done.stderr.strip().splitlines()[-1] and "Traceback" not in done.stderr
@@ -348,7 +350,7 @@ def test_as_a_process_from_another_folder(recording: Path, tmp_path: Path) -> No
     """Random events cannot be tracked: the run says so, exits with 1 and leaves its record."""
     done = subprocess.run(
         [sys.executable, str(SCRIPT), "data/walk/", "--weights", "random:0:16,16,8", "--", "--opts",
-         "PATCHES_PER_FRAME", "8"], capture_output=True, text=True, timeout=300, cwd=tmp_path,
+         "PATCHES_PER_FRAME", "8"], capture_output=True, text=True, timeout=900, cwd=tmp_path,
         env={**os.environ, "OMP_NUM_THREADS": "1"})
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     assert done.stdout.splitlines()[0] == "walk: no trajectory and no cloud"
