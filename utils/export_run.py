@@ -46,7 +46,8 @@ from utils.messages import say
 __all__ = ["ExportOptions", "export_pointcloud", "find_config", "find_weights", "say"]
 
 ROOT = Path(__file__).resolve().parents[1]
-DEFAULT_CONFIG = {"fpv": "eval_fpv.yaml", "rpg": "eval_rpg.yaml", "vector": "eval_vector.yaml"}
+DEFAULT_CONFIG = {"ecd": "eval_rpg.yaml"} | {
+    name: f"eval_{name}.yaml" for name in ("fpv", "rpg", "vector", "tumvie", "eds", "hku", "mvsec")}
 
 
 def find_config(name: str | None, dataset: str, weights: str = "") -> Path:

@@ -19,6 +19,7 @@ from tests.utils.raw_layouts.text_folders import write_ecd, write_fpv
 from utils.datasets.recognise import LAYOUTS, recognise
 from utils.datasets.registry import SequenceOptions, open_sequence
 from utils.events import Events
+from utils.export_run import find_config
 from utils.pipeline import stages
 from utils.preprocessing import PREPROCESSORS, find_sequences
 
@@ -67,6 +68,12 @@ CASES = {
 
 def test_every_preprocessor_is_tested() -> None:
     assert set(CASES) == set(PREPROCESSORS) == {layout.dataset for layout in LAYOUTS if layout.raw or layout.archive}
+
+
+@pytest.mark.parametrize("dataset", sorted(CASES))
+def test_published_weights_run_with_the_preset_of_the_data_set(dataset: str) -> None:
+    """The Event Camera Dataset has none of its own and the same sensor as rpg."""
+    assert find_config(None, dataset, "DEVO.pth").name == f"eval_{'rpg' if dataset == 'ecd' else dataset}.yaml"
 
 
 @pytest.mark.parametrize("dataset", sorted(CASES))
