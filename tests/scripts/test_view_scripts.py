@@ -155,7 +155,7 @@ def test_kinds_and_names_of_plots(call: Callable, run_folder: Path, tmp_path: Pa
     assert call("plot_pointcloud", "--pointcloud", "run.npy", "--format", "svg", "--plane", "yz")[0] == 0
     assert (run_folder / "run_yz.svg").read_text().startswith("<?xml")
     (run_folder / "run_yz.svg").unlink()
-    for words in (["--azim", "-90"], ["--kind", "overview", "--color-by", "observations"], ["--tight"]):
+    for words in (["--azim", "-90", "--tight"], ["--kind", "overview", "--color-by", "observations"]):
         assert call("plot_pointcloud", "run.ply", "-o", "{out}/p.png", *words)[0] == 0
     assert call("plot_trajectory", "truth.txt", "--unit", "m", "--out", "{out}/t.pdf")[0] == 0
     assert call("plot_trajectory", "--poses", "lone_poses.npy", "--points", "run.ply", "--points-out", "{out}/kept.ply",
