@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evals.validation.agreement import PLANE_SHARE
-from evals.validation.experiment import BOARD_SHARE, CLEANED, EMVS_DEVO, EMVS_TRUE, JUDGED_SHARE, Validation
+from evals.validation.experiment import BOARD_SHARE, CLEANED, EMVS_DEVO, EMVS_TRUE, JUDGED_SHARE, RAW, Validation
 from evals.validation.mapping import mask_agreement
 
 _PLANAR_SHARE = 0.8
@@ -133,10 +133,12 @@ def _why_incomplete(found: Validation) -> str:
     area = np.sort(np.ptp(found.points[CLEANED], axis=0))[1:].prod()
     per_disc = len(found.points[CLEANED]) / area * math.pi * found.judged_m**2
     at_ten = found.agreement(EMVS_TRUE, CLEANED).score("before ICP", 2 * found.judged_m).precision
+    raw = found.agreement(EMVS_TRUE, RAW).score("before ICP", found.judged_m).precision
     flat = f"{found.share_on_plane(EMVS_TRUE):.1%} of the map's points lie on the plane. " if is_planar(found) else ""
     return (f"{_systematic(found)}{flat}The exported cloud has {len(found.points[CLEANED])} points, median spacing "
             f"{1000 * spacing:.0f} mm, about {per_disc:.1f} in a disc of the threshold's radius "
-            f"({1000 * found.judged_m:.0f} mm); at twice the threshold the share is {at_ten:.1%}.")
+            f"({1000 * found.judged_m:.0f} mm); at twice the threshold the share is {at_ten:.1%}. The "
+            f"raw cloud reaches {raw:.1%} at the threshold itself.")
 
 
 def _why_inaccurate(found: Validation) -> str:
@@ -163,7 +165,7 @@ def _systematic(found: Validation) -> str:
         mapped = found.depth[EMVS_DEVO].bias
         if mapped * error.bias > 0 and abs(mapped) > 0.5 * abs(error.bias):
             text += (f"So does the map made with its poses ({mapped:+.1%}), which uses none of its depths: the poses "
-                     "are to blame. ")
+                     "are at fault. ")
     if "after ICP" in agreement.scores:
         score = agreement.score("after ICP", found.judged_m)
         text += (f"After rigid ICP the shares are {score.precision:.1%} (map near the cloud) and {score.recall:.1%} "
