@@ -22,6 +22,7 @@ from tests.devo.worlds import World, centre_pixels, dense_step, make_world
 from tests.tolerances import (
     BA_ACCURATE,
     BA_DENSE_STEP,
+    BA_FREE_SCALE,
     BA_ONE_STEP,
     BA_TWO_STEPS,
     REPROJECTION,
@@ -55,6 +56,11 @@ def tangents(new: Tensor, old: Tensor) -> Tensor:
 # --- parity ----------------------------------------------------------------------------------------------------
 
 
+def free_scale(inv_depths: Tensor, expected: Tensor) -> float:
+    """Best common factor: float32 leaves the scale open by some 1e-4, how much depends on the processor's sums."""
+    return float((inv_depths.double() * expected).sum() / inv_depths.double().square().sum())
+
+
 @pytest.mark.parametrize(("case", "t0", "t1", "iterations"), [("a", 1, 8, 1), ("b", 1, 8, 2), ("c", 4, 8, 2)])
 def test_reference_steps(fixture_npz: Fixture, solver: str, case: str, t0: int, t1: int, iterations: int) -> None:
     a = {key: torch.from_numpy(value) for key, value in fixture_npz("geometry").items()}
@@ -71,7 +77,9 @@ def test_reference_steps(fixture_npz: Fixture, solver: str, case: str, t0: int, 
     if solver == "published order":
         tolerance = BA_ONE_STEP if iterations == 1 else BA_TWO_STEPS
         torch.testing.assert_close(poses, expected_poses, rtol=0, atol=tolerance)
-        torch.testing.assert_close(patches, expected, rtol=0, atol=tolerance)
+        scale = free_scale(patches[0, :, 2], expected[0, :, 2])
+        assert abs(scale - 1) <= BA_FREE_SCALE
+        torch.testing.assert_close(scale * patches[:, :, 2], expected[:, :, 2], rtol=0, atol=tolerance)
     assert (poses - expected_poses).norm() <= BA_ACCURATE * expected_poses.norm()
     assert (patches - expected)[:, :, 2].norm() <= BA_ACCURATE * expected[:, :, 2].norm()
     assert torch.equal(result.patch_ids, torch.unique(a["kk"]))

@@ -99,7 +99,9 @@ def test_tensors_arrive_untouched() -> None:
 
 
 def test_ctrl_c_while_waiting_for_a_slow_stream_ends_the_program_at_once() -> None:
-    code = ("import time\nfrom utils.datasets.prefetch import prefetch\n"
+    # a shell that starts tests in the background makes them, and their children, ignore Ctrl-C
+    code = ("import signal, time\nfrom utils.datasets.prefetch import prefetch\n"
+            "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
             "def slow():\n    yield 1\n    time.sleep(0.3)\n    yield 2\n    time.sleep(0.3)\n    yield 3\n"
             "try:\n    for i in prefetch(slow()): print(i, flush=True)\n"
             "except KeyboardInterrupt: print('interrupted')\n")
