@@ -31,7 +31,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
     add("--config", help="settings of the odometry (default: the preset of the weights)")
     add("--opts", nargs="+", default=[], metavar="KEY VALUE", help="override settings of the odometry")
     add("--seed", type=int, default=0, help="seed of the first trial, which is shown (default: %(default)s)")
-    add("--trials", type=int, default=5, help="seeds to run (default: %(default)s)")
+    add("--trials", type=int, default=3, help="seeds to run (default: %(default)s)")
     add("--processes", type=int, default=0, help="trials side by side, 0 = one per core (default: %(default)s)")
     add("--start_us", type=float, help="begin of the part to use [us]")
     add("--stop_us", type=float, help="end of the part to use [us]")

@@ -68,7 +68,7 @@ class ValidationSettings:
     config: str | None = None
     opts: tuple[str, ...] = ()
     seed: int = 0
-    trials: int = 5
+    trials: int = 3
     processes: int = 0
     start_us: float | None = None
     stop_us: float | None = None
