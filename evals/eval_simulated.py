@@ -2,9 +2,10 @@
 """Measure the odometry on simulated sequences with perfect ground truth, against two baselines.
 
 Every sequence differs in scene, textures, motion and sensor size from what training draws (other seeds, and the
-hand-held motion of the full simulator instead of short clips). Variants: `trained` (the weights as they are), `random
-patches` (the same network, patches drawn at random instead of by its scorer) and `untrained` (the same architecture,
-random weights). A run counts as lost if the tracker says so or its error exceeds a fifth of the path.
+hand-held motion of the full simulator instead of short clips). Variants: `trained` (the preset as it is), `random
+patches`, `scored patches` and `gradient patches` (the same network, patches drawn at random, by its scorer, by the
+gradient of the event image) and `untrained` (the same architecture, random weights). A run counts as lost if the
+tracker says so or its error exceeds a fifth of the path.
 
 Example: python evals/eval_simulated.py --split test --trials 3
 """
@@ -31,7 +32,9 @@ PRESETS = ("slow", "normal", "normal", "fast", "slow")
 FIRST_SEED = {"val": 7_000, "test": 9_000}
 PER_SCENE = 5
 LOST_ABOVE = 0.2  # of the path length
-VARIANTS = ("trained", "random patches", "untrained")
+SELECTORS = {"random patches": "random", "scored patches": "scorer", "gradient patches": "gradient"}
+VARIANTS = ("trained", *SELECTORS, "untrained")
+DEFAULT_VARIANTS = ("trained", "random patches", "untrained")
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
     parser.add_argument("--weights", help="default: the built-in ones")
     parser.add_argument("--config", help="default: the preset of the built-in weights")
     parser.add_argument("--opts", nargs="+", default=[], help="override settings, KEY VALUE ...")
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(DEFAULT_VARIANTS))
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--trials", type=int, default=3)
     parser.add_argument("--every", type=int, default=1, help="use every n-th sequence")
@@ -188,8 +191,7 @@ def run_task(task: Task) -> Score:
     from devo.config import Config
 
     cfg = Config(task.settings)
-    if task.variant == "random patches":
-        cfg.PATCH_SELECTOR = "random"
+    cfg.PATCH_SELECTOR = SELECTORS.get(task.variant, cfg.PATCH_SELECTOR)
     network = _network(task.weights, task.variant, cfg.PATCH_SELECTOR)
     return evaluate(task.sequence, task.simulated, task.seconds, task.cache, network, cfg, task.variant, task.trial)
 
