@@ -94,7 +94,6 @@ def test_trials_side_by_side_equal_trials_one_by_one(repository: Path, tmp_path:
     assert tables[0] == tables[1] and len(tables[0]) == 5  # header, two trials, mean, standard deviation
 
 
-@pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom(repository: Path, tmp_path: Path) -> None:
     import nbformat
     from nbclient import NotebookClient
