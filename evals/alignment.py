@@ -90,3 +90,22 @@ def _smallest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
         return 2 * np.outer(across, across) - np.eye(3)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def aligned_path_share(source: np.ndarray, target: np.ndarray) -> tuple[float, float, Similarity]:
+    """How far two paths differ once the first is aligned to the second (Sim3).
+
+    Args:
+        source, target: `(N, 3)` paired positions.
+
+    Returns:
+        Rms distance over the length of the target (NaN where that is 0), the length, and the alignment.
+
+    Raises:
+        InputError: as `umeyama_sim3`.
+    """
+    alignment = umeyama_sim3(source, target)
+    error = np.linalg.norm(alignment.apply(source) - target, axis=1)
+    length = float(np.linalg.norm(np.diff(target, axis=0), axis=1).sum())
+    share = float(np.sqrt((error * error).mean())) / length if length > 0 else float("nan")
+    return share, length, alignment

@@ -109,13 +109,11 @@ def trajectory_share(tstamps: Any, poses: Any, stamps: Any, truth: Any) -> tuple
     """ATE (Sim3, RMSE) as a share of the true path between the matched frames, and the scale of the alignment."""
     import numpy as np
 
-    from evals.alignment import umeyama_sim3
+    from evals.alignment import aligned_path_share
 
     centres = np.stack([np.interp(tstamps, stamps, truth[:, axis]) for axis in range(3)], axis=1)
-    alignment = umeyama_sim3(poses[:, :3].astype(np.float64), centres)
-    error = np.linalg.norm(alignment.apply(poses[:, :3]) - centres, axis=1)
-    length = np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()
-    return float(np.sqrt((error * error).mean()) / length), float(alignment.scale)
+    share, _, alignment = aligned_path_share(poses[:, :3].astype(np.float64), centres)
+    return share, float(alignment.scale)
 
 
 def depth_error(observables: Any, scale: float, simulated: Any) -> float:

@@ -80,19 +80,16 @@ def compare(t_us: np.ndarray, world_T_cam: np.ndarray, back_t_us: np.ndarray, ba
     from scipy.spatial.transform import Rotation
 
     from devo.errors import InputError
-    from evals.alignment import umeyama_sim3
+    from evals.alignment import aligned_path_share
 
     common, first, second = np.intersect1d(np.round(t_us), np.round(end_us - back_t_us), return_indices=True)
     if len(common) < 3:
         raise InputError(f"{len(common)} windows have a pose in both directions, expected at least 3; use shorter "
                          "windows or a longer recording")
     forth, back = world_T_cam[first].astype(np.float64), back_world_T_cam[second].astype(np.float64)
-    alignment = umeyama_sim3(back[:, :3], forth[:, :3])
-    error = np.linalg.norm(alignment.apply(back[:, :3]) - forth[:, :3], axis=1)
-    length = float(np.linalg.norm(np.diff(forth[:, :3], axis=0), axis=1).sum())
+    share, length, alignment = aligned_path_share(back[:, :3], forth[:, :3])
     turned = Rotation.from_matrix(alignment.rotation) * Rotation.from_quat(back[:, 3:])
     angle = (turned.inv() * Rotation.from_quat(forth[:, 3:])).magnitude()
-    share = float(np.sqrt((error * error).mean())) / length if length > 0 else float("nan")
     return Agreement("tracked", "tracked", len(common), length, share, alignment.scale,
                      float(np.degrees(np.median(angle))))
 

@@ -17,7 +17,6 @@ Canvas = np.ndarray
 LOG_FLOOR = 0.04
 """Reflectance added before the logarithm, so that black paper is black and not minus infinity."""
 
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_COMPLEX)
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ0123456789#&%@?+=*"
 _SHIFT = 4  # cv2 draws with 1/16 pixel coordinates, which together with LINE_AA keeps edges smooth
@@ -250,10 +249,12 @@ def image_textures(folder: Path, count: int, size: int, rng: np.random.Generator
     Raises:
         InputError: no image in the folder, or one that cannot be read.
     """
+    from utils.datasets.files import IMAGE_SUFFIXES  # the package reads all data sets, training does not need it
+
     files = folder.iterdir() if folder.is_dir() else ()
-    paths = sorted(path for path in files if path.suffix.lower() in _IMAGE_SUFFIXES)
+    paths = sorted(path for path in files if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
-        raise InputError(f"{folder}: no images for textures, expected a folder with {', '.join(_IMAGE_SUFFIXES)}")
+        raise InputError(f"{folder}: no images for textures, expected a folder with {', '.join(IMAGE_SUFFIXES)}")
     order = np.concatenate([rng.permutation(len(paths)) for _ in range(-(-count // len(paths)))])[:count]
     return [_square_crop(paths[index], size, rng) for index in order]
 
