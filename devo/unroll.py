@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from devo.errors import InputError
+from devo.unroll_matching import MatchUpdate, match_frames, match_offsets
 from devo.unroll_state import GrowingGraph, JoinedClips, UnrollSettings
 from devo.voxel_augment import random_voxel_augment
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 BOUNDS_MARGIN = 64.0  # quarter-resolution pixels around the image within which a reprojection is used
 SOLVER_DAMPING = 10.0
 DEPTH_DAMPING = 1e-4
-PROBE_REACH = 3  # frames
-PROBE_BACKWARDS = 0.25
 
 
 class UnrollStep(NamedTuple):
@@ -65,26 +64,16 @@ class UnrollStep(NamedTuple):
     """(1,E) distance between reprojection and truth before the revision, no gradient."""
 
 
-class ProbeResult(NamedTuple):
-    """One update from a zero state on edges that stand alone."""
-
-    predicted: Tensor
-    """(1,E,2) patch centre plus revision."""
-    predicted_gt: Tensor
-    """(1,E,2)."""
-    predicted_valid: Tensor
-    """(1,E) bool."""
-    centre: Tensor
-    """(1,E,2) patch centre before the revision."""
-
-
 class UnrollResult(NamedTuple):
     """Everything the losses need."""
 
     steps: list[UnrollStep]
     poses_gt: SE3
     """(B,n) world -> camera, first frame of each clip = identity."""
-    probe: ProbeResult | None
+    probe: MatchUpdate | None
+    """Start-up matching, see `UnrollSettings.probe`."""
+    matches: list[MatchUpdate]
+    """Updates of edges that start away from the truth, see `UnrollSettings.match_updates`."""
 
 
 def unroll(
@@ -140,6 +129,12 @@ def unroll_clips(
     _check_shapes(images, disps, intrinsics)
     settings = settings or UnrollSettings()
     clips = JoinedClips(network, images, poses, disps, intrinsics, settings)
+    truth = type(clips.poses_gt)(clips.poses_gt.data.view(clips.clips, clips.frames, 7))
+    several = clips.frames > 1
+    probe = match_frames(clips) if settings.probe and several else None
+    matches = match_offsets(clips, settings.match_updates) if settings.match_updates and several else []
+    if settings.steps == 0:
+        return UnrollResult([], truth, probe, matches)
     if not settings.structure_only:
         clips.poses = clips.start_poses(start_fraction)
     graph = GrowingGraph(clips)
@@ -152,8 +147,9 @@ def unroll_clips(
         match = step % settings.match_gradient_every == 0
         steps.append(_one_update(clips, graph, differentiable, match, last))
         clips.poses, clips.patches = clips.poses.detach(), clips.patches.detach()
-    truth = type(clips.poses_gt)(clips.poses_gt.data.view(clips.clips, clips.frames, 7))
-    return UnrollResult(steps, truth, _probe(clips) if settings.probe and clips.frames > 1 else None)
+        if not last and float(torch.rand(())) < settings.depth_noise:
+            clips.disturb_depths()
+    return UnrollResult(steps, truth, probe, matches)
 
 
 def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, match: bool, last: bool) -> UnrollStep:
@@ -234,31 +230,6 @@ def _with_scores(step: UnrollStep, clips: JoinedClips, graph: GrowingGraph) -> U
         kk_full=edges[2],
         frame_distance=graph.distance[local].repeat(clips.clips),
     )
-
-
-def _probe(clips: JoinedClips) -> ProbeResult:
-    """Match each frame's patches with one other frame of its clip, from a zero state and without motion.
-
-    This is what the tracker does to find out whether the camera moved at all, before anything is known.
-    """
-
-    device = clips.patches.device
-    source = torch.arange(clips.frames, device=device)
-    reach = torch.randint(1, PROBE_REACH + 1, (clips.frames,)).to(device)
-    backwards = torch.rand(clips.frames).to(device) < PROBE_BACKWARDS
-    other = (source + torch.where(backwards, -reach, reach)).clamp(0, clips.frames - 1)
-    other = torch.where(other == source, torch.where(source > 0, source - 1, source + 1), other)
-    kk = torch.arange(clips.frames * clips.per_frame, device=device)
-    ii, jj, kk = clips.edges(kk // clips.per_frame, other.repeat_interleave(clips.per_frame), kk)
-    coords = clips.patches_gt[:, kk, :2].permute(0, 1, 3, 4, 2)
-    net = clips.context.new_zeros(1, len(kk), clips.context.shape[1], dtype=torch.float32)
-    from devo.edges import EdgeGroups
-
-    _, delta, _ = clips.update(net, coords, ii, jj, kk, EdgeGroups.build(ii, jj, kk))
-    truth, _, visible = clips.truth(ii, jj, kk)
-    middle = coords.shape[2] // 2
-    centre = coords[:, :, middle, middle]
-    return ProbeResult(centre + delta, truth[:, :, middle, middle], visible, centre)
 
 
 def _check_shapes(images: Tensor, disps: Tensor, intrinsics: Tensor) -> None:

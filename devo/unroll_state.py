@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 FLAT_INV_DEPTH = 0.5
 FLAT_SPREAD = 0.5  # standard deviation, in octaves
+DISTURBANCE = 0.4  # standard deviation of ln(inverse depth)
+DISTURBED_SHARE = 0.5  # of the patches
 DEPTH_TOLERANCE = 0.15  # relative excess of inverse depth beyond which a point counts as hidden behind another
 
 
@@ -27,7 +29,7 @@ class UnrollSettings:
     """How the graph is built and what is reported.
 
     Attributes:
-        steps: number of updates.
+        steps: number of updates; 0 for matching alone (`probe`, `match_updates`).
         patches_per_image: patches per frame, M.
         structure_only: poses start at the truth and stay; only inverse depths are solved.
         initial_frames: frames of the dense first graph; it also is the number of updates before the graph grows.
@@ -40,6 +42,8 @@ class UnrollSettings:
             the others only move the geometry.
         match_gradient_every: the correlation features carry gradient to the encoders in every k-th update.
         probe: also run one update from a zero state on single edges between two frames, as the tracker's start-up does.
+        match_updates: also run so many updates on edges that start off the truth, each in its own way.
+        depth_noise: chance, per update, that the inverse depths of half of the patches are disturbed after it.
         mixed_precision: None (float32) or the type of autocast for encoders and update operator.
     """
 
@@ -55,6 +59,8 @@ class UnrollSettings:
     solver_gradient_every: int = 1
     match_gradient_every: int = 1
     probe: bool = False
+    match_updates: int = 0
+    depth_noise: float = 0.0
     mixed_precision: torch.dtype | None = None
 
 
@@ -111,6 +117,14 @@ class JoinedClips:
 
     def _with_depth(self, inv_depth: Tensor) -> Tensor:
         return torch.cat([self.patches_gt[:, :, :2], inv_depth.expand_as(self.patches_gt[:, :, 2:])], dim=2)
+
+    def disturb_depths(self) -> None:
+        """Multiply the inverse depths of some patches by random factors, so that each needs a correction of its own."""
+        count = self.patches.shape[1]
+        factor = torch.where(
+            torch.rand(count) < DISTURBED_SHARE, torch.exp(DISTURBANCE * torch.randn(count)), torch.ones(count)
+        )
+        self.patches = self._with_depth(self.patches[:, :, 2:] * factor.to(self.patches).view(1, -1, 1, 1, 1))
 
     def start_poses(self, fraction: Tensor | None) -> SE3:
         """Poses between identity (fraction 0) and the truth (1) along the geodesic of each frame.

@@ -13,7 +13,7 @@ from devo.errors import InputError
 from devo.lietorch import SE3
 from devo.losses import direct_loss, flow_loss, pose_loss
 from devo.unroll import UnrollResult, unroll, unroll_clips
-from devo.unroll_state import UnrollSettings
+from devo.unroll_state import JoinedClips, UnrollSettings
 from tests.tolerances import JOINED_CLIPS
 
 PATCHES = 6
@@ -204,6 +204,31 @@ def test_every_parameter_gets_a_finite_gradient() -> None:
         assert parameter.grad is not None, name
         assert bool(torch.isfinite(parameter.grad).all()), name
         assert float(parameter.grad.abs().max()) > 0, name
+
+
+def test_matched_edges_start_off_the_truth_each_in_its_own_way() -> None:
+    result = run(2, 4, steps=0, match_updates=2, probe=True)
+    assert result.steps == [] and result.probe is not None
+    first, second = result.matches
+    offset = (first.centre - first.predicted_gt).view(2, -1, PATCHES, 2)  # frame pair, patch
+    own = offset - offset.mean(dim=2, keepdim=True)
+    assert float(own.norm(dim=-1).median()) > 0.1
+    assert float(offset.mean(dim=2).norm(dim=-1).median()) > 0.1
+    torch.testing.assert_close(second.centre, first.predicted)
+    torch.testing.assert_close(second.predicted_gt, first.predicted_gt)
+
+
+def test_disturbed_depths_are_some_of_them_and_positive() -> None:
+    torch.manual_seed(0)
+    images, poses, disps, intrinsics = random_clips(1, 4, 0)
+    settings = UnrollSettings(patches_per_image=64, flat_depth=1.0)
+    clips = JoinedClips(FixedPatches(), images, poses, disps, intrinsics, settings)  # type: ignore[arg-type]
+    before = clips.patches.clone()
+    clips.disturb_depths()
+    ratio = (clips.patches / before)[0, :, 2, 1, 1]
+    assert 0.35 < float((ratio != 1).float().mean()) < 0.65
+    assert 0.3 < float(ratio[ratio != 1].log().std()) < 0.5
+    assert torch.equal(clips.patches[:, :, :2], before[:, :, :2])
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:

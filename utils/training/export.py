@@ -59,6 +59,7 @@ MEANING = {
     "first": "median error of the first update",
     "last": "median error of the last update before bundle adjustment",
     "probe": "median error of one update on single edges",
+    "match": "median error after three updates of edges that start off the truth, each in its own way",
     "probe_ratio": "predicted over true motion there",
     "rotation": "median rotation error of frame pairs, degrees",
     "ate": "median position error over path length of a clip",

@@ -9,7 +9,7 @@ from pathlib import Path
 from utils.atomic import atomic_path
 
 PANELS = (
-    ("total", "direct", "direct_first", "probe"),
+    ("total", "direct", "direct_first", "probe", "match"),
     ("flow", "flow_last"),
     ("pose",),
     ("scores",),

@@ -25,6 +25,8 @@ class LossSettings:
         direct: per update, error of the revised centres before bundle adjustment.
         direct_first: factor on `direct` for the first update, which the tracker's start-up depends on.
         probe: error of one update on stand-alone edges from a zero state.
+        match: per update of `match_updates`, the direct, fine and confidence losses of edges that start off the truth,
+            with their own weights.
         fine: per update, ln(1 + error/0.2 px) of the same revised centres.
         confidence: per update, likelihood of these errors under the predicted confidence; gives the weights a meaning
             before the solver's gradients do.
@@ -37,6 +39,7 @@ class LossSettings:
     direct: float = 0.15
     direct_first: float = 2.0
     probe: float = 0.6
+    match: float = 4.0
     fine: float = 0.15
     confidence: float = 0.05
     published_from: int = 300
@@ -53,7 +56,9 @@ class TrainSettings:
         structure_only: probability, per step, that poses stay at the truth.
         perturbed: probability, per clip, to start between identity and truth (else at identity).
         flat_depth: probability, per clip, of equal initial depths, see `devo.unroll_state.UnrollSettings`.
-        solver_gradient_every, match_gradient_every: see `devo.unroll_state.UnrollSettings`.
+        solver_gradient_every, match_gradient_every, match_updates, depth_noise: see
+            `devo.unroll_state.UnrollSettings`.
+        unroll_every: the loop with bundle adjustment runs in every k-th step, the others learn matching alone.
         score_every: the scorer runs with gradient in every k-th step.
         steps, learning_rate, warmup, schedule, clip_gradient, weight_decay, ema: optimisation; `warmup` in steps,
             schedule onecycle (published, linear), cosine or constant.
@@ -79,6 +84,9 @@ class TrainSettings:
     flat_depth: float = 0.7
     solver_gradient_every: int = 1
     match_gradient_every: int = 2
+    match_updates: int = 3
+    depth_noise: float = 0.1
+    unroll_every: int = 1
     score_every: int = 4
     steps: int = 10000
     learning_rate: float = 7e-4

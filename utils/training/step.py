@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +23,7 @@ from devo.losses import (
     score_loss,
 )
 from devo.unroll import UnrollResult, UnrollStep, prepare_images, unroll_clips
+from devo.unroll_matching import MatchUpdate
 from devo.unroll_state import UnrollSettings
 from utils.training.settings import LossSettings, TrainSettings
 
@@ -37,12 +39,14 @@ class StepPlan:
         start_fraction: (B,) where each clip's poses start between identity (0) and truth (1).
         published_weight: factor of the flow and pose losses, 0..1.
         train_scorer: the scorer gets its loss in this step.
+        unroll: this step runs the loop with bundle adjustment.
     """
 
     structure_only: bool
     start_fraction: Tensor
     published_weight: float
     train_scorer: bool
+    unroll: bool = True
 
 
 def plan_step(settings: TrainSettings, step: int, generator: torch.Generator) -> StepPlan:
@@ -52,7 +56,8 @@ def plan_step(settings: TrainSettings, step: int, generator: torch.Generator) ->
     fraction = torch.rand(settings.clips, generator=generator) * perturbed
     ramp = settings.loss.published_from
     weight = 1.0 if ramp <= 0 else min(1.0, max(0.0, (step - ramp) / ramp))
-    return StepPlan(structure_only, fraction, weight, step % settings.score_every == 0)
+    return StepPlan(structure_only, fraction, weight, step % settings.score_every == 0,
+                    step % settings.unroll_every == 0)
 
 
 class TrainingStep(nn.Module):
@@ -63,18 +68,20 @@ class TrainingStep(nn.Module):
         self.network = network
         self.settings = settings
 
-    def unroll_settings(self, structure_only: bool = False) -> UnrollSettings:
-        """The graph schedule of training steps."""
+    def unroll_settings(self, plan: StepPlan) -> UnrollSettings:
+        """The graph schedule of a training step."""
         wanted = self.settings
         return UnrollSettings(
-            steps=wanted.updates,
+            steps=wanted.updates if plan.unroll else 0,
             patches_per_image=wanted.patches,
-            structure_only=structure_only,
+            structure_only=plan.structure_only,
             initial_frames=wanted.initial_frames,
             solver_gradient_every=wanted.solver_gradient_every,
             match_gradient_every=wanted.match_gradient_every,
             flat_depth=wanted.flat_depth,
             probe=wanted.loss.probe > 0,
+            match_updates=wanted.match_updates if wanted.loss.match > 0 else 0,
+            depth_noise=wanted.depth_noise,
             mixed_precision=PRECISIONS[wanted.precision],
         )
 
@@ -88,7 +95,7 @@ class TrainingStep(nn.Module):
             poses,
             clips.inv_depths,
             clips.intrinsics,
-            self.unroll_settings(plan.structure_only),
+            self.unroll_settings(plan),
             plan.start_fraction.to(images.device),
         )
         return total_loss(result, self.settings.loss, plan)
@@ -96,46 +103,74 @@ class TrainingStep(nn.Module):
 
 def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> dict[str, Tensor]:
     """Weighted sum of all losses of an unrolled batch, see `LossSettings`; parts are means over the updates."""
-    parts: dict[str, list[Tensor]] = {name: [] for name in ("flow", "pose", "direct", "fine", "confidence")}
-    total = result.steps[0].predicted.new_zeros(())
+    parts: dict[str, list[Tensor]] = defaultdict(list)
+    total = result.poses_gt.data.new_zeros(())
     for number, step in enumerate(result.steps):
-        direct = direct_loss(step.predicted, step.predicted_gt, step.predicted_valid)
-        total = total + weights.direct * (weights.direct_first if number == 0 else 1.0) * direct
-        parts["direct"].append(direct)
-        seen = step.predicted, step.predicted_gt, step.predicted_valid
-        for name, weight, loss in (
-            ("fine", weights.fine, fine_loss(*seen)),
-            ("confidence", weights.confidence, confidence_loss(step.weight, *seen)),
-        ):
-            total = total + weight * loss
-            parts[name].append(loss)
-        if step.coords is None or plan.published_weight == 0:
-            continue
-        flow = flow_loss(step.coords, step.coords_gt, step.valid)
-        parts["flow"].append(flow)
-        total = total + plan.published_weight * weights.flow * flow
-        if number >= 2 and not plan.structure_only and step.poses is not None:
-            frames = step.poses.shape[1]
-            pair = step.poses.data, result.poses_gt.data[:, :frames]
-            pose = pose_loss(*pair, used=same_direction(*pair))[0]
-            parts["pose"].append(pose)
-            total = total + plan.published_weight * weights.pose * pose
+        first = weights.direct_first if number == 0 else 1.0
+        total = total + _revision_loss(step, weights, parts, first)
+        total = total + _solution_loss(step, number, result, weights, plan, parts)
+    for match in result.matches:
+        matched: dict[str, list[Tensor]] = defaultdict(list)
+        share = weights.match / len(result.matches)
+        total = total + share * _revision_loss(match, weights, matched)
+        parts["match"] += matched["direct"]
     if result.probe is not None and weights.probe > 0:
         probe = direct_loss(result.probe.predicted, result.probe.predicted_gt, result.probe.predicted_valid)
         total = total + weights.probe * probe
         parts["probe"] = [probe]
-    scores = last_score_loss(result.steps[-1])
+    scores = last_score_loss(result.steps[-1]) if result.steps else None
     if scores is not None and plan.train_scorer:
         total = total + weights.scores * scores
         parts["scores"] = [scores]
     report = {name: torch.stack(values).detach().mean() for name, values in parts.items() if values}
-    first = result.steps[0]
-    report["start"] = masked_mean(first.start_error.clamp(max=20.0), first.predicted_valid)
-    report["direct_first"] = parts["direct"][0].detach()
-    report["direct_last"] = parts["direct"][-1].detach()
+    if result.steps:
+        start = result.steps[0]
+        report["start"] = masked_mean(start.start_error.clamp(max=20.0), start.predicted_valid)
+        report["direct_first"] = parts["direct"][0].detach()
+        report["direct_last"] = parts["direct"][-1].detach()
     if parts["flow"]:
         report["flow_last"] = parts["flow"][-1].detach()
     return {"total": total, **report}
+
+
+def _revision_loss(
+    step: UnrollStep | MatchUpdate, weights: LossSettings, parts: dict[str, list[Tensor]], direct_factor: float = 1.0
+) -> Tensor:
+    """Losses of one update before bundle adjustment; notes them in `parts`."""
+    seen = step.predicted, step.predicted_gt, step.predicted_valid
+    total = step.predicted.new_zeros(())
+    for name, weight, loss in (
+        ("direct", weights.direct * direct_factor, direct_loss(*seen)),
+        ("fine", weights.fine, fine_loss(*seen)),
+        ("confidence", weights.confidence, confidence_loss(step.weight, *seen)),
+    ):
+        total = total + weight * loss
+        parts[name].append(loss)
+    return total
+
+
+def _solution_loss(
+    step: UnrollStep,
+    number: int,
+    result: UnrollResult,
+    weights: LossSettings,
+    plan: StepPlan,
+    parts: dict[str, list[Tensor]],
+) -> Tensor:
+    """Published losses of update `number`, after bundle adjustment; notes them in `parts`."""
+    total = step.predicted.new_zeros(())
+    if step.coords is None or plan.published_weight == 0:
+        return total
+    flow = flow_loss(step.coords, step.coords_gt, step.valid)
+    parts["flow"].append(flow)
+    total = total + plan.published_weight * weights.flow * flow
+    if number >= 2 and not plan.structure_only and step.poses is not None:
+        frames = step.poses.shape[1]
+        pair = step.poses.data, result.poses_gt.data[:, :frames]
+        pose = pose_loss(*pair, used=same_direction(*pair))[0]
+        parts["pose"].append(pose)
+        total = total + plan.published_weight * weights.pose * pose
+    return total
 
 
 def last_score_loss(step: UnrollStep) -> Tensor | None:

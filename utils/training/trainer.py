@@ -41,6 +41,7 @@ LOG_NAMES = (
     "direct_first",
     "direct_last",
     "probe",
+    "match",
     "flow",
     "flow_last",
     "pose",

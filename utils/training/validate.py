@@ -15,6 +15,8 @@ from devo.unroll import UnrollResult, unroll_clips
 from devo.unroll_state import UnrollSettings
 from utils.training.step import last_score_loss
 
+MATCH_UPDATES = 3
+
 
 @dataclass(frozen=True)
 class ValidationSettings:
@@ -37,7 +39,8 @@ def validate(
         flow: median error after bundle adjustment over edges of neighbouring frames, quarter-resolution pixels.
         start: median true displacement before the first update. first, last: median error of the revised centres in the
         first and last update. probe: median error of single edges from a zero state, probe_ratio: median predicted over
-        median true displacement there. rotation: median degrees. ate: median over clips of the position error (rms)
+        median true displacement there. match: median error after three updates of edges that start off the truth, each
+        in its own way. rotation: median degrees. ate: median over clips of the position error (rms)
         over the path length. score: scorer loss. confidence: mean weight.
     """
     was_training = network.training
@@ -54,9 +57,8 @@ def validate(
         finally:
             network.train(was_training)
     joined = {name: torch.cat(values) for name, values in gathered.items()}
-    result = {
-        name: float(joined[name].median()) for name in ("flow", "start", "first", "last", "probe", "rotation", "ate")
-    }
+    medians = ("flow", "start", "first", "last", "probe", "match", "rotation", "ate")
+    result = {name: float(joined[name].median()) for name in medians}
     result["flow90"] = float(joined["flow"][:: max(1, len(joined["flow"]) // 1000000)].quantile(0.9))
     result["lost"] = float((joined["ate"] > 0.3).float().mean())
     result["probe_ratio"] = float(joined["probe_length"].median() / joined["probe_true"].median().clamp(min=1e-6))
@@ -77,11 +79,12 @@ def _figures(network: eVONet, clips: TrainingClips, settings: ValidationSettings
             drop_probability=0.0,
             flat_depth=1.0,
             probe=True,
+            match_updates=MATCH_UPDATES,
             initial_frames=settings.initial_frames,
         ),
     )
     first, last = unrolled.steps[0], unrolled.steps[-1]
-    probe = unrolled.probe
+    probe, match = unrolled.probe, unrolled.matches[-1]
     assert probe is not None and last.coords is not None and last.poses is not None
     score = last_score_loss(last)
     figures = {
@@ -90,6 +93,7 @@ def _figures(network: eVONet, clips: TrainingClips, settings: ValidationSettings
         "first": (first.predicted - first.predicted_gt).norm(dim=-1)[first.predicted_valid],
         "last": (last.predicted - last.predicted_gt).norm(dim=-1)[last.predicted_valid],
         "probe": (probe.predicted - probe.predicted_gt).norm(dim=-1)[probe.predicted_valid],
+        "match": (match.predicted - match.predicted_gt).norm(dim=-1)[match.predicted_valid],
         "probe_length": (probe.predicted - probe.centre).norm(dim=-1)[probe.predicted_valid],
         "probe_true": (probe.predicted_gt - probe.centre).norm(dim=-1)[probe.predicted_valid],
         "confidence": last.weight[last.predicted_valid],
