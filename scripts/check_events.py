@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
 
-from scripts.cli import AliasParser, run_cli  # noqa: E402
 from scripts.event_options import add_reading_options, reading_options, warn_in_one_line  # noqa: E402
+from utils.cli import AliasParser, run_cli  # noqa: E402
 
 if TYPE_CHECKING:
     from utils.events import EventReader, Events

@@ -15,7 +15,7 @@ from typing import Any
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
 
-from scripts.cli import AliasParser, run_cli  # noqa: E402
+from utils.cli import AliasParser, run_cli  # noqa: E402
 
 
 def build_parser() -> AliasParser:

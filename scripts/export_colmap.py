@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from scripts.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
+from utils.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 
 if TYPE_CHECKING:
     from utils.colmap.export import FolderInput

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from scripts.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 from scripts.edge_options import add_edge_options, add_focus_options  # noqa: E402
 from scripts.recording_options import add_recording_options  # noqa: E402
+from utils.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 
 
 def build_arg_parser(datapath_required: bool = True) -> argparse.ArgumentParser:
@@ -54,7 +54,7 @@ def build_arg_parser(datapath_required: bool = True) -> argparse.ArgumentParser:
     edges = parser.add_argument_group("edge cloud: edges of the events with depths of the patches around them")
     edges.add_argument("--export_edge_cloud", action="store_true", help="write _edges.npy, .ply")
     edges.add_argument("--edge_cloud_out", help="file of that cloud")
-    add_edge_options(edges, "edge")
+    add_edge_options(edges)
 
     focus = parser.add_argument_group("focus-refined edge cloud: depths at which neighbouring event images agree")
     focus.add_argument("--export_focus_edge_cloud", action="store_true",
@@ -80,7 +80,7 @@ def run_export_pointcloud(args: argparse.Namespace) -> int:
     from utils.export_run import ExportOptions, export_pointcloud
 
     try:
-        export_pointcloud(ExportOptions(**vars(args)))
+        export_pointcloud(ExportOptions.from_flags(vars(args)))
     except DevoError:
         if args.debug:
             traceback.print_exc()

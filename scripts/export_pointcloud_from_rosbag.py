@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from scripts.cli import run_cli  # noqa: E402 - needs the path above
 from scripts.export_pointcloud import build_arg_parser as build_export_parser  # noqa: E402
 from scripts.export_pointcloud import run_export_pointcloud  # noqa: E402
+from utils.cli import run_cli  # noqa: E402 - needs the path above
 
 BAG_FLAGS = ("bag", "delta_ms", "output_dir", "skip_preprocess", "camera_info_topic")
 

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from scripts.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 from scripts.preprocess_cli import preprocess_main  # noqa: E402
+from utils.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 
 _SIDE_OF_CAMERA = {"0": "left", "1": "right"}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 
-from scripts.cli import AliasParser
+from utils.cli import AliasParser
 
 
 def build_arg_parser(dataset: str, description: str | None, sides: tuple[str, ...]) -> AliasParser:

@@ -18,12 +18,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from scripts.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
+from scripts.edge_options import add_edge_options  # noqa: E402
 from scripts.export_pointcloud import build_arg_parser as build_export_parser  # noqa: E402
+from utils.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 
 if TYPE_CHECKING:
     from utils.pipeline import PipelineOptions
 
+EDGE_OPTIONS = ("topk", "border", "knn", "max_dist")
 OWN_EXPORT_FLAGS = {"--datapath": "the folder", "--dataset": "--dataset", "--side": "--side",
                     "--out": "--outdir and --outname", "--frame-data-out": "--frame_out",
                     "--weights": "--weights", "--config": "--config", "--device": "--device", "--seed": "--seed",
@@ -68,10 +70,7 @@ def build_arg_parser() -> argparse.ArgumentParser:
 def _add_edges(parser: AliasParser) -> None:
     edges = parser.add_argument_group("edge cloud")
     edges.add_argument("--export_edge_cloud", action="store_true", help="also write points along image edges")
-    edges.add_argument("--edge_topk", type=int, default=6000, help="edge pixels per frame")
-    edges.add_argument("--edge_border", type=int, default=2, help="border without edges [quarter pixels]")
-    edges.add_argument("--edge_knn", type=int, default=4, help="patches whose depths are interpolated")
-    edges.add_argument("--edge_max_dist", type=float, default=6.0, help="how far those may be [quarter pixels]")
+    add_edge_options(edges, EDGE_OPTIONS)
 
 
 def _add_cleanup(parser: AliasParser) -> None:
@@ -125,8 +124,8 @@ def export_arguments(args: argparse.Namespace, forwarded: Sequence[str], parser:
             words += [f"--{name}", getattr(args, name)]
     if args.export_edge_cloud:
         words.append("--export_edge_cloud")
-        for name in ("edge_topk", "edge_border", "edge_knn", "edge_max_dist"):
-            words += [f"--{name}", str(getattr(args, name))]
+        for name in EDGE_OPTIONS:
+            words += [f"--edge_{name}", str(getattr(args, f"edge_{name}"))]
     return vars(build_export_parser().parse_args([*words, *forwarded]))
 
 

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from scripts.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 from scripts.scene_options import add_input_flags  # noqa: E402
+from utils.cli import AliasParser, run_cli  # noqa: E402 - needs the path above
 
 
 def build_arg_parser() -> argparse.ArgumentParser:

@@ -17,7 +17,6 @@ from utils.export_products import CONVENTIONS, run_environment
 
 _FROM_OPTIONS = ("dataset", "datapath", "side", "start_us", "stop_us", "stride", "export_frame_data", "frame_mode",
                  "save_per_frame_cloud", "per_frame_keep", "voxel_size", "rgb", "seed", "device", "workers")
-_PREFIXES = ("edge_", "focus_")
 
 
 @dataclass
@@ -70,7 +69,9 @@ class ExportRecord:
 
     def _options(self) -> dict[str, Any]:
         values = vars(self.options)
-        flags = {name: values[name] for name in values if name.startswith(_PREFIXES) and not name.endswith("_out")}
+        flags: dict[str, Any] = {}
+        for prefix, settings in (("edge", self.options.edge), ("focus", self.options.focus)):
+            flags |= {f"{prefix}_{name}": value for name, value in vars(settings).items()}
         return {name: values[name] for name in _FROM_OPTIONS} | flags
 
     def _outcome(self) -> dict[str, Any]:

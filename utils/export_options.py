@@ -65,33 +65,10 @@ class ExportOptions:
     save_observations: bool = False
     export_edge_cloud: bool = False
     edge_cloud_out: str | None = None
-    edge_downsample: int = 4
-    edge_topk: int = 6000
-    edge_border: int = 2
-    edge_knn: int = 4
-    edge_max_dist: float = 6.0
-    edge_legacy_pixels: bool = False
+    edge: EdgeSettings = EdgeSettings()
     export_focus_edge_cloud: bool = False
     focus_edge_cloud_out: str | None = None
-    focus_downsample: int = 4
-    focus_topk: int = 6000
-    focus_border: int = 2
-    focus_knn: int = 4
-    focus_max_dist: float = 6.0
-    focus_legacy_pixels: bool = False
-    focus_edges: str = "ridge"
-    focus_support: int = 4
-    focus_support_stride: int = 1
-    focus_rho_samples: int = 25
-    focus_rho_rel: float = 0.2
-    focus_rho_abs: float | None = None
-    focus_patch_radius: int = 1
-    focus_guard: int = 2
-    focus_min_peak_ratio: float = 1.2
-    focus_min_score: float = 0.0
-    focus_min_baseline: float = 0.0
-    focus_keyframe_stride: int = 1
-    focus_max_keyframes: int = 0
+    focus: FocusSettings = FocusSettings()
     convert_ply: bool = False
     cleanup: bool = True
     cleanup_algo: str = "sor"
@@ -100,14 +77,23 @@ class ExportOptions:
     ror_radius: float | None = None
     ror_min_neighbors: int | None = None
 
+    @classmethod
+    def from_flags(cls, flags: dict[str, Any]) -> ExportOptions:
+        """Options from parsed flags by name; `--edge_*` and `--focus_*` go into `edge` and `focus`.
+
+        Raises:
+            InputError: a value of an edge cloud that makes no sense.
+        """
+        own = {field.name for field in fields(cls)}
+        return cls(**{name: value for name, value in flags.items() if name in own},
+                   edge=settings_from(EdgeSettings, "edge", flags), focus=settings_from(FocusSettings, "focus", flags))
+
     def check(self) -> None:
         """Refuse what cannot work before the long run begins.
 
         Raises:
             InputError: a value or a combination that makes no sense.
         """
-        self.edge_settings()
-        self.focus_settings()
         for product in ("edge_cloud", "focus_edge_cloud"):
             self.edge_cloud_file(product)
         if self.rgb and (self.export_edge_cloud or self.export_focus_edge_cloud):
@@ -128,14 +114,6 @@ class ExportOptions:
         """Where `edge_cloud` or `focus_edge_cloud` was asked to go; None = beside the other products."""
         name = getattr(self, f"{product}_out")
         return None if name is None else cloud_file(name, f"--{product}_out")
-
-    def edge_settings(self) -> EdgeSettings:
-        """The part that concerns the edge cloud."""
-        return settings_from(EdgeSettings, "edge", vars(self))
-
-    def focus_settings(self) -> FocusSettings:
-        """The part that concerns the focus-refined edge cloud."""
-        return settings_from(FocusSettings, "focus", vars(self))
 
     def sequence_options(self) -> SequenceOptions:
         """The part that concerns the recording."""

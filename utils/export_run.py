@@ -159,7 +159,7 @@ class _Recorders:
         folder = Path(options.save_per_frame_cloud_path) if options.save_per_frame_cloud else None
         dpviewer = products.path("_dpviewer.npy") if options.save_dpviewer_cloud else None
         self.map = MapRecorder(folder, options.voxel_size, dpviewer, keep=options.per_frame_keep)
-        self.edges = EdgeRecorder(options.edge_settings()) if options.export_edge_cloud else None
+        self.edges = EdgeRecorder(options.edge) if options.export_edge_cloud else None
         self.observations: Observations | None = None
 
     def track(self, sequence: Recording, cfg: Config, network: torch.nn.Module, device: torch.device) -> TrackingResult:
@@ -234,7 +234,7 @@ def _write_frames(products: Products, record: ExportRecord) -> FrameBundle | Non
 def _focus_cloud(sequence: Recording, bundle: FrameBundle, options: ExportOptions, device: torch.device) -> PointCloud:
     """The focus-refined edge cloud from a second pass over the recording; only a window of it is held."""
     with _stream(sequence, options) as frames:
-        return collect_focus_cloud(frames, bundle, options.focus_settings(), device)
+        return collect_focus_cloud(frames, bundle, options.focus, device)
 
 
 def _write_edges(products: Products, record: ExportRecord, product: str, cloud: PointCloud) -> None:

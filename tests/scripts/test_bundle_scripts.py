@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scripts.cli import run_cli
 from tests.oracle import HEIGHT, INTRINSICS, WIDTH, OracleScene
 from tests.utils.dotted_scene import FRAME_US, write_recording
 from tests.utils.test_overlays import bundle_of
+from utils.cli import run_cli
 from utils.clouds.io import read_cloud
 from utils.frame_bundle import write_frame_bundle
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from devo.errors import DevoError, InputError, TrackingError
-from scripts.cli import INTERRUPTED, AliasParser, run_cli
+from utils.cli import INTERRUPTED, AliasParser, run_cli
 from utils.clouds import PointCloud, read_cloud, write_cloud
 
 
@@ -241,7 +241,7 @@ def test_run_cli_leaves_defects_their_traceback() -> None:
 
 
 def test_a_closed_pipe_ends_quietly(repository: Path) -> None:
-    code = ("import sys; from scripts.cli import run_cli\n"
+    code = ("import sys; from utils.cli import run_cli\n"
             "def main(argv):\n    [print('x' * 100) for _ in range(10000)]\n    sys.stdout.flush()\n"
             "sys.exit(run_cli(main))")
     with subprocess.Popen([sys.executable, "-c", code], cwd=repository, stdout=subprocess.PIPE,

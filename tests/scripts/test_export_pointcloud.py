@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scripts.cli import run_cli
 from scripts.export_pointcloud import main
+from utils.cli import run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "scripts" / "export_pointcloud.py"

@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,13 @@ import torch
 import utils.eval_utils as drivers
 import utils.export_run as export_run
 from evals.alignment import umeyama_sim3
-from scripts.cli import run_cli
 from scripts.export_focus_edge_cloud_only import main as focus_only
 from scripts.export_pointcloud import build_arg_parser, main
 from tests.oracle import HEIGHT, INTRINSICS, WIDTH, OracleNetwork, OracleScene, OracleTracker
 from tests.utils.dotted_scene import FRAME_US, write_recording
+from utils.cli import run_cli
 from utils.clouds.io import read_cloud
+from utils.edge_clouds.settings import EdgeSettings, FocusSettings
 from utils.export_options import ExportOptions
 from utils.frame_bundle import read_frame_bundle
 from utils.trajectory_io import inverted, rotation_matrices
@@ -228,7 +230,11 @@ def test_run_voxel_writes_the_edge_cloud(scene: OracleScene, tmp_path: Path, mon
 
 def test_flags_and_options_have_the_same_names_and_defaults() -> None:
     parsed = vars(build_arg_parser().parse_args(["--datapath", "here"]))
-    assert parsed == vars(ExportOptions("here"))
+    assert ExportOptions.from_flags(parsed) == ExportOptions("here")
+    names = {field.name for field in fields(ExportOptions)} - {"edge", "focus"}
+    for prefix, kind in (("edge", EdgeSettings), ("focus", FocusSettings)):
+        names |= {f"{prefix}_{field.name}" for field in fields(kind)} - {"edge_edges"}
+    assert set(parsed) == names
 
 
 BAD = {

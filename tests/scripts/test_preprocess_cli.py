@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from scripts.cli import run_cli
 from tests.utils.raw_layouts.recording import random_recording
 from tests.utils.raw_layouts.text_folders import write_ecd
+from utils.cli import run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("pp_*.py"))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from devo.errors import DevoError, InputError
 from scripts import run_emvs
-from scripts.cli import run_cli
+from utils.cli import run_cli
 from utils.clouds import PointCloud, read_cloud, write_cloud
 from utils.emvs.views import PoseTrack
 from utils.events import make_events, write_events_h5

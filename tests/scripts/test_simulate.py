@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from scripts.cli import run_cli
 from scripts.simulate import main
+from utils.cli import run_cli
 
 
 def test_help_does_not_import_torch(repository: Path) -> None:

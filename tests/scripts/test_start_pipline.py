@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from devo.errors import TrackingError
-from scripts.cli import run_cli
 from scripts.start_pipline import main
 from tests.scripts.export_stand_in import FRAMES, POINTS, StandIn
+from utils.cli import run_cli
 from utils.clouds.io import read_cloud
 from utils.pipeline import stages
 from utils.preprocessing import PREPROCESSORS, PreprocessOptions
@@ -234,7 +234,7 @@ def test_mapping_with_ros(call: Callable, export: StandIn, recording: Path, tmp_
 
 def test_edge_clouds_get_files_for_viewers(call: Callable, export: StandIn, recording: Path) -> None:
     assert call(recording, "--export-edge-cloud", "--edge_topk", 99).returncode == 0
-    assert export.calls[0].export_edge_cloud and export.calls[0].edge_topk == 99
+    assert export.calls[0].export_edge_cloud and export.calls[0].edge.topk == 99
     assert len(read_cloud("results/walk/pointcloud_edges.ply")) == POINTS
     assert 0 < len(read_cloud("results/walk/pointcloud_edges_cleaned.ply")) < POINTS
     # the same folder, now without edges: those of the run before are not taken for products of this one

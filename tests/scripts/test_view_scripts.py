@@ -20,9 +20,9 @@ import scripts.plot_trajectory as plot_trajectory
 import scripts.pointcloud_to_rosbag as to_bag
 import scripts.prepare_emvs_bag as prepare
 import scripts.view_pointcloud as view
-from scripts.cli import run_cli
 from tests.utils.bag_samples import pieces, write_bag
 from utils.calibration import Calibration
+from utils.cli import run_cli
 from utils.clouds import PointCloud, read_cloud, write_cloud
 from utils.colmap.observations import Observations, save_observations
 from utils.events import make_events, write_events_h5

@@ -46,7 +46,7 @@ def run_pipeline(options: PipelineOptions) -> PipelineResult:
         InputError: nothing can be run with these arguments.
         OutputError: the record cannot be written.
     """
-    found = locate_sequence(options.dataset, options.indir, ExportOptions(**options.export).sequence_options())
+    found = locate_sequence(options.dataset, options.indir, ExportOptions.from_flags(options.export).sequence_options())
     say(f"recognised: {found}")
     plan = Plan(options, found)
     stages = plan.stages()

@@ -74,7 +74,7 @@ class Plan:
         return [*stages, self._view()] if self.options.view else stages
 
     def _export_options(self) -> ExportOptions:
-        asked = ExportOptions(**self.options.export)
+        asked = ExportOptions.from_flags(self.options.export)
         per_frame = asked.save_per_frame_cloud_path
         if per_frame == ExportOptions.save_per_frame_cloud_path:
             per_frame = str(self.folder / "clouds")
