@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 MAX_SCALE = 10.0
+PEAK_SHARPNESS = 3.0  # logits per unit of correlation
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -82,6 +83,28 @@ def confidence_loss(
     """
     error = torch.where(valid[..., None], (predicted.detach() - coords_gt).abs().clamp(max=limit), limit)
     return 0.5 * (weights * (error / scale).square() - weights.clamp(min=1e-6).log()).mean()
+
+
+def peak_loss(correlation: Tensor, centre: Tensor, coords_gt: Tensor, valid: Tensor) -> Tensor:
+    """Cross entropy between the softmax of a correlation window and the true position in it (bilinear weights).
+
+    Trains the features themselves: the correlation has to be largest where the patch really is. Edges whose true
+    position lies outside the window take no part.
+
+    Args:
+        correlation: (1,E,S,S) at shifts (x, y) of -r..r pixels, S = 2r+1.
+        centre: (1,E,2) position of the shift (0,0), quarter-resolution pixels.
+        coords_gt: (1,E,2) true position.
+        valid: (1,E) bool.
+    """
+    side = correlation.shape[-1]
+    place = coords_gt - centre + side // 2
+    inside = valid & ((place >= 0) & (place <= side - 1)).all(dim=-1)
+    cells = torch.arange(side, device=place.device, dtype=place.dtype)
+    near = (1.0 - (place[..., None] - cells).abs()).clamp(min=0)  # (1,E,2,S)
+    target = near[..., 0, :, None] * near[..., 1, None, :]
+    logits = PEAK_SHARPNESS * correlation.flatten(2)
+    return masked_mean(-(target.flatten(2) * logits.log_softmax(dim=-1)).sum(dim=-1), inside)
 
 
 def alignment_scale(centres_gt: Tensor, centres: Tensor, limit: float = MAX_SCALE) -> Tensor:

@@ -31,6 +31,8 @@ class MatchUpdate(NamedTuple):
     """(1,E,2) patch centre before the revision."""
     weight: Tensor
     """(1,E,2) confidence."""
+    correlation: Tensor
+    """(1,E,7,7) correlation of the patch at shifts (x, y) of -3..3 pixels from the centre, mean over its pixels."""
 
 
 def match_frames(clips: JoinedClips) -> MatchUpdate:
@@ -84,8 +86,13 @@ def _updates(
     middle = coords.shape[2] // 2
     steps = []
     for _ in range(updates):
-        net, delta, weight = clips.update(net, coords, *edges, groups)
+        corr = clips.look_up(coords, *edges[1:])
+        net, delta, weight = clips.revise(net, corr, *edges, groups)
         centre = coords[:, :, middle, middle]
-        steps.append(MatchUpdate(centre + delta, truth[:, :, middle, middle], visible, centre, weight))
+        side = 2 * clips.correlate.radius + 1
+        finest = corr.float().view(1, -1, side, side, coords.shape[2] ** 2, len(clips.correlate.levels))[..., 0]
+        steps.append(
+            MatchUpdate(centre + delta, truth[:, :, middle, middle], visible, centre, weight, finest.mean(dim=-1))
+        )
         coords = coords + delta.detach()[:, :, None, None]
     return steps

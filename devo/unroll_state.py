@@ -201,7 +201,17 @@ class JoinedClips:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One update of the hidden state, `(net, delta, weight)`, at reprojections (1,E,P,P,2)."""
         with contextlib.nullcontext() if match_gradient else torch.no_grad():
-            corr = self.correlate(kk, jj, coords.permute(0, 1, 4, 2, 3))
+            corr = self.look_up(coords, jj, kk)
+        return self.revise(net, corr, ii, jj, kk, groups)
+
+    def look_up(self, coords: Tensor, jj: Tensor, kk: Tensor) -> Tensor:
+        """Correlation features (1,E,7*7*P*P*2) around reprojections (1,E,P,P,2): shift x, shift y, patch, level."""
+        return self.correlate(kk, jj, coords.permute(0, 1, 4, 2, 3))
+
+    def revise(
+        self, net: Tensor, corr: Tensor, ii: Tensor, jj: Tensor, kk: Tensor, groups: EdgeGroups
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the update operator makes of correlation features: `(net, delta, weight)`."""
         with self.autocast():
             context = self.context.index_select(0, kk)[None]
             net, (delta, weight, _) = self.network.update(net, context, corr, None, ii, jj, kk, groups=groups)

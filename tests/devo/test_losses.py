@@ -9,12 +9,14 @@ import torch
 
 from devo.lietorch import SE3
 from devo.losses import (
+    PEAK_SHARPNESS,
     alignment_scale,
     confidence_loss,
     direct_loss,
     fine_loss,
     flow_loss,
     masked_mean,
+    peak_loss,
     pose_errors,
     pose_loss,
     score_loss,
@@ -131,3 +133,30 @@ def test_fine_loss_weighs_relative_precision() -> None:
     assert loss.item() == pytest.approx((math.log(2) + math.log(4)) / 2)
     (gradient,) = torch.autograd.grad(loss, errors)
     assert gradient.abs().sum(-1)[0].tolist() == pytest.approx([1.25, 0.625])
+
+
+def test_peak_loss_is_smallest_where_the_correlation_peaks_at_the_truth() -> None:
+    centre, truth = torch.tensor([[[10.0, 20.0]]]), torch.tensor([[[11.0, 18.0]]])  # shift (1, -2)
+    valid = torch.ones(1, 1, dtype=torch.bool)
+    losses = torch.empty(7, 7)
+    for x in range(7):
+        for y in range(7):
+            correlation = torch.zeros(1, 1, 7, 7)
+            correlation[0, 0, x, y] = 2.0
+            losses[x, y] = peak_loss(correlation, centre, truth, valid)
+    assert losses.argmin() == 4 * 7 + 1
+    assert float(peak_loss(torch.zeros(1, 1, 7, 7), centre, truth, valid)) == pytest.approx(math.log(49))
+    for outside in (truth + 3.5, truth - 3.5):
+        assert float(peak_loss(torch.rand(1, 1, 7, 7), outside, truth, valid)) == 0.0
+
+
+def test_peak_loss_shares_the_target_between_neighbours_and_passes_gradcheck() -> None:
+    centre = torch.zeros(1, 1, 2, dtype=torch.float64)
+    truth = torch.tensor([[[0.25, 0.0]]], dtype=torch.float64)
+    valid = torch.ones(1, 1, dtype=torch.bool)
+    correlation = torch.zeros(1, 1, 7, 7, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(peak_loss(correlation, centre, truth, valid), correlation)
+    target = 1 / 49 - gradient[0, 0] / PEAK_SHARPNESS  # softmax of zeros minus gradient
+    assert float(target[3, 3]) == pytest.approx(0.75)
+    assert float(target[4, 3]) == pytest.approx(0.25)
+    assert torch.autograd.gradcheck(lambda c: peak_loss(c, centre, truth, valid), correlation)

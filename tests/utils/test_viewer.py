@@ -158,7 +158,7 @@ def test_a_browser_draws_the_points(
     suffix = "#canvas" if renderer == "canvas" else ""
     save_page(tmp_path / "full.html", scene(), title="board", t_us=STAMPS)
     full, errors = screenshot(browser, tmp_path / "full.html", tmp_path / f"{renderer}.png", suffix)
-    record_property("screenshot", tmp_path / f"{renderer}.png")
+    record_property("screenshot", str(tmp_path / f"{renderer}.png"))
     assert "Uncaught" not in errors, errors[-2000:]
     assert full.shape == (HEIGHT, WIDTH, 3)
     middle = full[120:520, 200:750]  # no panel, legend or axes here

@@ -27,6 +27,8 @@ class LossSettings:
         probe: error of one update on stand-alone edges from a zero state.
         match: per update of `match_updates`, the direct, fine and confidence losses of edges that start off the truth,
             with their own weights.
+        peak: of the same edges, cross entropy between their correlation windows and the true positions; trains the
+            features without the detour through the update operator.
         fine: per update, ln(1 + error/0.2 px) of the same revised centres.
         confidence: per update, likelihood of these errors under the predicted confidence; gives the weights a meaning
             before the solver's gradients do.
@@ -40,6 +42,7 @@ class LossSettings:
     direct_first: float = 2.0
     probe: float = 0.6
     match: float = 4.0
+    peak: float = 0.5
     fine: float = 0.15
     confidence: float = 0.05
     published_from: int = 300

@@ -18,6 +18,7 @@ from devo.losses import (
     flow_errors,
     flow_loss,
     masked_mean,
+    peak_loss,
     pose_loss,
     same_direction,
     score_loss,
@@ -114,6 +115,9 @@ def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> d
         share = weights.match / len(result.matches)
         total = total + share * _revision_loss(match, weights, matched)
         parts["match"] += matched["direct"]
+        peak = peak_loss(match.correlation, match.centre, match.predicted_gt, match.predicted_valid)
+        parts["peak"].append(peak)
+        total = total + weights.peak / len(result.matches) * peak
     if result.probe is not None and weights.probe > 0:
         probe = direct_loss(result.probe.predicted, result.probe.predicted_gt, result.probe.predicted_valid)
         total = total + weights.probe * probe

@@ -42,6 +42,7 @@ LOG_NAMES = (
     "direct_last",
     "probe",
     "match",
+    "peak",
     "flow",
     "flow_last",
     "pose",
