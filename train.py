@@ -24,6 +24,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         help="go on exactly from a last.pth; 'auto' takes the run's own if it exists",
     )
     add("--init", default=None, metavar="WEIGHTS", help="start from these weights, with fresh optimiser")
+    add("--only", choices=("scorer",), default=None, help="train this part alone, the rest stays as it is")
     add("--minutes", type=float, default=None, help="stop (and save) after this wall-clock time")
     add("--threads", type=int, default=None, help="CPU threads of the trainer")
     add("--device", default=None, help="cpu or cuda (default: cuda where available)")

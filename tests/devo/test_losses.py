@@ -15,6 +15,7 @@ from devo.losses import (
     direct_loss,
     fine_loss,
     flow_loss,
+    information_loss,
     masked_mean,
     peak_loss,
     pose_errors,
@@ -160,3 +161,32 @@ def test_peak_loss_shares_the_target_between_neighbours_and_passes_gradcheck() -
     assert float(target[3, 3]) == pytest.approx(0.75)
     assert float(target[4, 3]) == pytest.approx(0.25)
     assert torch.autograd.gradcheck(lambda c: peak_loss(c, centre, truth, valid), correlation)
+
+
+def test_information_loss_is_smallest_at_half_the_inverse_of_the_relative_squared_error() -> None:
+    error = torch.tensor([0.1, 0.2, 0.2, 0.4, 0.2]).repeat(2)[None]  # one frame of 5 patches, each seen twice
+    kk, valid = torch.arange(5).repeat(2), torch.ones(1, 10, dtype=torch.bool)
+    raw = torch.zeros(1, 5, dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.Adam([raw], lr=0.05)
+    for _ in range(800):
+        optimiser.zero_grad()
+        loss, rank = information_loss(torch.sigmoid(raw), error.double(), valid, kk)
+        loss.backward()
+        optimiser.step()
+    score = torch.sigmoid(raw)[0].detach()
+    torch.testing.assert_close(score[1:], torch.tensor([0.5, 0.5, 0.125, 0.5], dtype=torch.float64), atol=1e-3, rtol=0)
+    assert score[0] > 0.95  # 2 is out of reach
+    assert float(rank) > 0.8
+    scaled, _ = information_loss(score[None], 3 * error.double(), valid, kk)
+    same, _ = information_loss(score[None], error.double(), valid, kk)
+    assert float(scaled) == pytest.approx(float(same))  # how fast a clip moves does not matter
+
+
+def test_information_loss_leaves_out_patches_that_were_hardly_seen() -> None:
+    kk, error = torch.tensor([0, 0, 1, 1, 2, 2]), torch.tensor([[0.2, 0.2, 0.4, 0.4, 3.0, math.nan]])
+    valid = torch.tensor([[True, True, True, True, True, False]])
+    scores = torch.full((1, 3), 0.3, requires_grad=True)
+    information_loss(scores, error, valid, kk)[0].backward()
+    assert scores.grad is not None
+    assert float(scores.grad[0, 2]) == 0.0
+    assert bool((scores.grad[0, :2] != 0).all())

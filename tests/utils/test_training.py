@@ -142,6 +142,21 @@ def test_matching_alone_is_learned_without_the_loop(tmp_path: Path) -> None:
     assert matched[-1] < 0.8 * matched[0]
 
 
+def test_the_scorer_alone_is_trained_and_nothing_else(tmp_path: Path) -> None:
+    trainer = make_trainer(tmp_path, only="scorer", learning_rate=5e-3, weight_decay=0.0)
+    before = state_of(trainer)
+    ranks = []
+    for _ in range(40):
+        torch.manual_seed(0)
+        values = trainer.train_step()
+        assert math.isfinite(values["total"])
+        ranks.append(values["score_rank"])
+    after = state_of(trainer)
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed and all(name.startswith("patchify.scorer.") for name in changed)
+    assert ranks[-1] > ranks[0] + 0.1
+
+
 def test_resume_is_bit_exact(tmp_path: Path) -> None:
     def source() -> FixedSource:
         return FixedSource(lambda step: moving_plane(2, 3, seed=step))

@@ -13,6 +13,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "small": {"dim_inet": 192, "dim_fnet": 96, "dim": 24, "norm": "std", "patches": 48, "clips": 4},
     "base": {"dim_inet": 384, "dim_fnet": 128, "dim": 32, "norm": "std", "patches": 80, "clips": 2},
 }
+PARTS = ("", "scorer")
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class TrainSettings:
 
     Attributes:
         dim_inet, dim_fnet, dim, norm: network.
+        only: "scorer" trains the scorer alone, on the errors with which the network (as it is) matches patches drawn
+            uniformly, see `devo.losses.information_loss`; "" trains everything.
         patches: patches per frame. frames: frames per clip. updates: updates per step. initial_frames: dense start.
         clips: clips per step. sizes: (height, width) windows, one drawn per step.
         structure_only: probability, per step, that poses stay at the truth.
@@ -76,6 +79,7 @@ class TrainSettings:
     dim: int = 16
     norm: str = "std"
     randaug: bool = False
+    only: str = ""
     patches: int = 24
     frames: int = 8
     updates: int = 6
@@ -118,6 +122,8 @@ class TrainSettings:
         Raises:
             InputError: unknown preset or field.
         """
+        if changes.get("only", "") not in PARTS:
+            raise InputError(f"unknown part {changes['only']!r} to train; expected one of {', '.join(PARTS[1:])}")
         if name not in PRESETS:
             raise InputError(f"unknown preset {name!r}; expected one of {', '.join(PRESETS)}")
         known = {item.name for item in fields(cls)}

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from devo.data_readers.base import TrainingClips
 from devo.enet import eVONet
+from devo.errors import InputError
 from devo.lietorch import SE3
 from devo.losses import (
     confidence_loss,
@@ -17,6 +18,7 @@ from devo.losses import (
     fine_loss,
     flow_errors,
     flow_loss,
+    information_loss,
     masked_mean,
     peak_loss,
     pose_loss,
@@ -90,6 +92,8 @@ class TrainingStep(nn.Module):
         """Total loss (key `total`) and its parts (without gradient) for a batch on the network's device."""
         images = prepare_images(self.network, clips.voxels)
         poses = SE3(clips.world_T_cam).inv()
+        if self.settings.only == "scorer":
+            return self._scorer_loss(clips, images, poses)
         result = unroll_clips(
             self.network,
             images,
@@ -100,6 +104,22 @@ class TrainingStep(nn.Module):
             plan.start_fraction.to(images.device),
         )
         return total_loss(result, self.settings.loss, plan)
+
+    def _scorer_loss(self, clips: TrainingClips, images: Tensor, poses: SE3) -> dict[str, Tensor]:
+        """How well the scorer foresees the matching errors of patches drawn uniformly."""
+        settings = UnrollSettings(
+            steps=0,
+            patches_per_image=self.settings.patches,
+            match_updates=max(1, self.settings.match_updates),
+            uniform_patches=True,
+        )
+        result = unroll_clips(self.network, images, poses, clips.inv_depths, clips.intrinsics, settings)
+        match = result.matches[-1]
+        if result.scores is None:
+            raise InputError("this network has no scorer to train")
+        error = (match.predicted - match.predicted_gt).norm(dim=-1)
+        loss, correlation = information_loss(result.scores, error, match.predicted_valid, match.kk)
+        return {"total": loss, "scores": loss.detach(), "score_rank": correlation}
 
 
 def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> dict[str, Tensor]:

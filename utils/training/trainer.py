@@ -47,6 +47,7 @@ LOG_NAMES = (
     "flow_last",
     "pose",
     "scores",
+    "score_rank",
     "fine",
     "confidence",
 )
@@ -127,7 +128,9 @@ class Trainer:
         clips = self.source.batch(index).to(self.device)
         plan = plan_step(settings, self.step, generator_for(settings.seed, 3, index))
         self.network.train()
-        self.network.patchify.scorer.requires_grad_(plan.train_scorer)
+        if settings.only == "scorer":
+            self.network.requires_grad_(False)
+        self.network.patchify.scorer.requires_grad_(plan.train_scorer or settings.only == "scorer")
         losses = self.module(clips, plan)
         self.optimiser.zero_grad(set_to_none=True)
         self.scaler.scale(losses["total"]).backward()
@@ -231,7 +234,7 @@ class Trainer:
             )
             TrainingLog(self.run.folder / "validation.csv").append({"step": self.step, **figures})
             merit = figure_of_merit(figures)
-            better = merit < self.best
+            better = merit < self.best or bool(self.settings.only)  # merit says little about a part, the newest is best
             if better:
                 self.best = merit
                 save_checkpoint(
