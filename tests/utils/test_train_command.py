@@ -11,10 +11,12 @@ import pytest
 import torch
 
 import train
-from devo.checkpoint import load_network, read_checkpoint
+from devo.checkpoint import load_network, read_checkpoint, save_checkpoint
 from devo.data_readers.base import TrainingClips
+from devo.enet import eVONet
 from devo.errors import InputError
 from tests.utils.test_training import moving_plane
+from utils.training.average import main as average_main
 from utils.training.export import main as export_main
 from utils.training.launch import settings_from_options
 from utils.training.log import read_log
@@ -84,9 +86,6 @@ def test_short_run_then_resume_then_export(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_start_from_weights_of_other_dimensions_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from devo.checkpoint import save_checkpoint
-    from devo.enet import eVONet
-
     save_checkpoint(tmp_path / "other.pth", eVONet(dim_inet=16, dim_fnet=8, dim=8))
     code = train.main([*SHORT, "--runs", str(tmp_path), "--init", str(tmp_path / "other.pth")])
     assert code == 2
@@ -141,3 +140,33 @@ def test_tartan_without_data_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
 def test_help_does_not_import_torch(repository: Path) -> None:
     code = "import sys, train\ntry: train.main(['--help'])\nexcept SystemExit: pass\nassert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], cwd=repository, check=True, capture_output=True)
+
+
+def test_average_of_runs_is_the_mean_of_their_weights(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    networks = []
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        networks.append(eVONet(dim_inet=24, dim_fnet=16, dim=8, norm="std"))
+        save_checkpoint(tmp_path / f"{seed}.pth", networks[-1])
+    moving = {"values": {name: torch.zeros_like(value) for name, value in networks[1].state_dict().items()}}
+    save_checkpoint(tmp_path / "last.pth", networks[1], average=moving)
+    out = tmp_path / "mean.pth"
+    for second, expected in (("1.pth", networks[1].state_dict()), ("last.pth", moving["values"])):
+        assert average_main([str(tmp_path / "0.pth"), str(tmp_path / second), "--out", str(out)]) == 0
+        for name, value in load_network(out).state_dict().items():
+            torch.testing.assert_close(value, (networks[0].state_dict()[name] + expected[name]) / 2)
+    save_checkpoint(tmp_path / "other.pth", eVONet(dim_inet=24, dim_fnet=8, dim=8, norm="std"))
+    capsys.readouterr()
+    assert average_main([str(tmp_path / "0.pth"), str(tmp_path / "other.pth"), "--out", str(out)]) == 2
+    assert "equal dimensions" in capsys.readouterr().err
+
+
+def test_only_the_scorer_from_given_weights(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    start = eVONet(**settings_from_options(train.parse_arguments([])).network_arguments())
+    save_checkpoint(tmp_path / "start.pth", start)
+    arguments = [*SHORT, "--runs", str(tmp_path), "--name", "scorer", "--only", "scorer", "--steps", "2"]
+    assert train.main([*arguments, "--init", str(tmp_path / "start.pth")]) == 0
+    trained = load_network(tmp_path / "scorer" / "best.pth").state_dict()
+    same = {name: torch.equal(value, trained[name]) for name, value in start.state_dict().items()}
+    assert all(equal != name.startswith("patchify.scorer.") for name, equal in same.items())
