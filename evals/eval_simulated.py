@@ -53,6 +53,12 @@ class Score:
     fps: float
 
     @property
+    def row(self) -> str:
+        """One line of the table."""
+        return (f"| {self.sequence} | {self.variant} | {self.trial} | {self.status} | {100 * self.ate:.2f} | "
+                f"{100 * self.depth:.2f} | {self.points} | {self.keyframes} | {self.fps:.2f} |")
+
+    @property
     def lost(self) -> bool:
         """Whether the result is unusable."""
         return self.status != "tracked" or not self.ate <= LOST_ABOVE
@@ -152,6 +158,61 @@ def summarise(scores: Sequence[Score], variant: str) -> dict[str, Any]:
             "points": median([score.points for score in good]), "fps": median([score.fps for score in mine])}
 
 
+class Report:
+    """Scores of an evaluation, in a file that grows with every run, so that a stopped evaluation can go on.
+
+    Args:
+        path: JSON file, or None to keep nothing; scores that it holds already are taken over.
+        about: what the scores depend on.
+
+    Raises:
+        InputError: the file belongs to something else.
+    """
+
+    def __init__(self, path: Path | None, about: dict[str, Any]) -> None:
+        from devo.errors import InputError
+
+        self.path, self.about = path, about
+        self.scores: list[Score] = []
+        if path is None or not path.is_file():
+            return
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            self.scores = [Score(**entry) for entry in found["scores"]]
+            other = [name for name, value in about.items() if found["about"].get(name) != value]
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"--json {path} is no report of this command ({error}); choose another file") from error
+        if other:
+            raise InputError(f"--json {path} was made with other {' and '.join(other)}; choose another file")
+
+    def add(self, score: Score) -> None:
+        """Take in one run and write the file."""
+        from utils.atomic import atomic_path
+
+        self.scores.append(score)
+        if self.path is not None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            content = {"about": self.about, "summary": self.summary(), "scores": [asdict(s) for s in self.scores]}
+            with atomic_path(self.path) as temporary:
+                temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+    def summary(self) -> list[dict[str, Any]]:
+        """One row per variant."""
+        return [summarise(self.scores, name) for name in dict.fromkeys(score.variant for score in self.scores)]
+
+
+def _fingerprint(weights: str, selector: str) -> str:
+    """Of what the weights are, not where they lie."""
+    import hashlib
+
+    from devo.checkpoint import load_network
+
+    digest = hashlib.sha256()
+    for name, value in load_network(weights, patch_selector=selector).state_dict().items():
+        digest.update(name.encode() + value.numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
 def build_arg_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = AliasParser(prog="eval_simulated.py", description=__doc__)
@@ -166,7 +227,8 @@ def build_arg_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seconds", type=float, default=3.0, help="length of the sequences [s]")
     parser.add_argument("--jobs", type=int, default=1, help="processes of one thread each; 1 uses all threads in turn")
     parser.add_argument("--cache", type=Path, default=Path("datasets/simulated"), help="where sequences are kept")
-    parser.add_argument("--json", type=Path, help="also write all scores to this file")
+    parser.add_argument("--json", type=Path, help="also write all scores to this file, after every run; runs that it "
+                                                  "holds are not repeated")
     return parser
 
 
@@ -240,20 +302,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     cfg = Config().merge_from_file(find_config(args.config, "generic", weights)).merge_from_list(args.opts)
     chosen = [(name, settings) for name, settings in sequences(args.split) if settings["scene"] in args.scenes]
     tasks = [Task(name, settings, args.seconds, args.cache, weights, cfg.as_dict(), variant, trial)
-             for name, settings in chosen[::args.every] for variant in args.variants for trial in range(args.trials)]
-    scores: list[Score] = []
+             for trial in range(args.trials) for name, settings in chosen[::args.every] for variant in args.variants]
+    report = Report(args.json, {"split": args.split, "seconds": args.seconds, "config": cfg.as_dict(),
+                                "weights": _fingerprint(weights, cfg.PATCH_SELECTOR)})
     print("| sequence | variant | trial | status | ATE % | depth % | points | keyframes | fps |\n|" + "---|" * 9)
-    for score in run_all(tasks, args.jobs):
-        scores.append(score)
-        print(f"| {score.sequence} | {score.variant} | {score.trial} | {score.status} | {100 * score.ate:.2f} | "
-              f"{100 * score.depth:.2f} | {score.points} | {score.keyframes} | {score.fps:.2f} |", flush=True)
-    rows = [summarise(scores, variant) for variant in args.variants]
+    for score in report.scores:
+        print(score.row, flush=True)
+    done = {(score.sequence, score.variant, score.trial) for score in report.scores}
+    for score in run_all([task for task in tasks if (task.sequence, task.variant, task.trial) not in done], args.jobs):
+        report.add(score)
+        print(score.row, flush=True)
+    rows = report.summary()
     print("\n| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
     for row in rows:
         print("| " + " | ".join(f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()) + " |")
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps({"summary": rows, "scores": [asdict(score) for score in scores]}, indent=2))
     return 0
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evals.eval_simulated import SCENES, SIZES, Score, sequences, summarise, trajectory_share
+from devo.errors import InputError
+from evals.eval_simulated import SCENES, SIZES, Report, Score, sequences, summarise, trajectory_share
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -70,6 +71,21 @@ def test_command_simulates_tracks_and_tabulates(tmp_path: Path) -> None:
     report = json.loads((tmp_path / "scores.json").read_text())
     assert report["summary"][0]["lost runs"] == 1 and len(report["scores"]) == 1
     assert (tmp_path / "cache/board_slow_240x180_7000_0.3s/events.h5").is_file()
+
+
+def test_report_grows_with_every_run_and_goes_on_only_with_the_same_settings(tmp_path: Path) -> None:
+    path, about = tmp_path / "new" / "scores.json", {"split": "val", "weights": "abc"}
+    report = Report(path, about)
+    report.add(score(0.01))
+    report.add(score(math.nan, "not initialized", "b"))
+    again = Report(path, about)
+    assert [entry.sequence for entry in again.scores] == ["a", "b"] and again.scores[0] == report.scores[0]
+    assert again.summary()[0]["runs"] == 2
+    with pytest.raises(InputError, match="made with other weights"):
+        Report(path, {**about, "weights": "xyz"})
+    path.write_text("[]")
+    with pytest.raises(InputError, match="no report"):
+        Report(path, about)
 
 
 def test_command_refuses_what_it_does_not_know() -> None:
