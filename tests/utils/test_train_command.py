@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -152,7 +153,9 @@ def test_average_of_runs_is_the_mean_of_their_weights(tmp_path: Path, capsys: py
     save_checkpoint(tmp_path / "last.pth", networks[1], average=moving)
     out = tmp_path / "mean.pth"
     for second, expected in (("1.pth", networks[1].state_dict()), ("last.pth", moving["values"])):
-        assert average_main([str(tmp_path / "0.pth"), str(tmp_path / second), "--out", str(out)]) == 0
+        assert average_main([str(tmp_path / "0.pth"), str(tmp_path / second), "--out", str(out), "--cache",
+                             str(tmp_path), "--validation-clips", "8"]) == 0
+        assert math.isfinite(read_checkpoint(out)["validation"]["flow"])
         for name, value in load_network(out).state_dict().items():
             torch.testing.assert_close(value, (networks[0].state_dict()[name] + expected[name]) / 2)
     save_checkpoint(tmp_path / "other.pth", eVONet(dim_inet=24, dim_fnet=8, dim=8, norm="std"))
