@@ -49,8 +49,6 @@ python -m utils.training.export runs/{run}/best.pth devo/weights/{name}.pth
 ## Limits
 * Trained on small images (80 to 144 pixels high) of static scenes: moving objects and flicker were never seen.
 * Pure rotation gives no parallax; depth is then undefined, as for every monocular odometry.
-* Patches in flat areas are matched by their surroundings: the scorer has little to choose from, scored patches are
-  hardly better than random ones.
 * Motion above about 12 quarter-resolution pixels between neighbouring frames lies outside the correlation windows.
 """
 
