@@ -109,8 +109,8 @@ def information_loss(
     with torch.no_grad():
         used = valid[0].to(error.dtype)
         count = torch.zeros(scores.numel(), device=error.device, dtype=error.dtype).index_add_(0, kk, used)
-        squared = error[0].clamp(max=limit).square() * used
-        total = torch.zeros_like(count).index_add_(0, kk, torch.where(valid[0], squared, 0.0))
+        squared = torch.where(valid[0], error[0].clamp(max=limit).square(), 0.0)
+        total = torch.zeros_like(count).index_add_(0, kk, squared)
         known = (count >= MIN_MATCHES).view_as(scores)
         mean = torch.where(known, (total / count.clamp(min=1)).view_as(scores), torch.nan)
         relative = mean / mean.nanmedian(dim=1, keepdim=True).values.clamp(min=1e-6)

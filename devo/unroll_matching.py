@@ -51,7 +51,7 @@ def match_frames(clips: JoinedClips) -> MatchUpdate:
     kk = torch.arange(clips.frames * clips.per_frame, device=device)
     edges = clips.edges(kk // clips.per_frame, other.repeat_interleave(clips.per_frame), kk)
     coords = clips.patches_gt[:, edges[2], :2].permute(0, 1, 3, 4, 2)
-    return _updates(clips, edges, coords, 1)[0]
+    return _updates(clips, edges, clips.truth(*edges), coords, 1)[0]
 
 
 def match_offsets(clips: JoinedClips, updates: int) -> list[MatchUpdate]:
@@ -74,18 +74,23 @@ def match_offsets(clips: JoinedClips, updates: int) -> list[MatchUpdate]:
     spread = 2.0 ** (low + (high - low) * torch.rand(2, clips.clips, 1, 1, 1))
     common = torch.randn(clips.clips, len(near), 1, 2) * spread[0]
     own = torch.randn(clips.clips, len(near), per_frame, 2) * spread[1]
-    coords = clips.truth(*edges)[0] + (common + own).reshape(1, -1, 1, 1, 2).to(device)
-    return _updates(clips, edges, coords, updates)
+    truth = clips.truth(*edges)
+    coords = truth[0] + (common + own).reshape(1, -1, 1, 1, 2).to(device)
+    return _updates(clips, edges, truth, coords, updates)
 
 
 def _updates(
-    clips: JoinedClips, edges: tuple[Tensor, Tensor, Tensor], coords: Tensor, updates: int
+    clips: JoinedClips,
+    edges: tuple[Tensor, Tensor, Tensor],
+    truth: tuple[Tensor, Tensor, Tensor],
+    coords: Tensor,
+    updates: int,
 ) -> list[MatchUpdate]:
     """Revise positions (1,E,P,P,2) from a zero state, each time from where the last revision led."""
     groups = EdgeGroups.build(*edges)
     net = clips.context.new_zeros(1, len(edges[2]), clips.context.shape[1], dtype=torch.float32)
-    truth, _, visible = clips.truth(*edges)
     middle = coords.shape[2] // 2
+    centre_gt, visible = truth[0][:, :, middle, middle], truth[2]
     steps = []
     for _ in range(updates):
         corr = clips.look_up(coords, *edges[1:])
@@ -94,9 +99,7 @@ def _updates(
         side = 2 * clips.correlate.radius + 1
         finest = corr.float().view(1, -1, side, side, coords.shape[2] ** 2, len(clips.correlate.levels))[..., 0]
         steps.append(
-            MatchUpdate(
-                centre + delta, truth[:, :, middle, middle], visible, centre, weight, edges[2], finest.mean(dim=-1)
-            )
+            MatchUpdate(centre + delta, centre_gt, visible, centre, weight, edges[2], finest.mean(dim=-1))
         )
         coords = coords + delta.detach()[:, :, None, None]
     return steps

@@ -205,10 +205,8 @@ def _fingerprint(weights: str, selector: str) -> str:
     """Of what the weights are, not where they lie."""
     import hashlib
 
-    from devo.checkpoint import load_network
-
     digest = hashlib.sha256()
-    for name, value in load_network(weights, patch_selector=selector).state_dict().items():
+    for name, value in _network(weights, "trained", selector).state_dict().items():
         digest.update(name.encode() + value.numpy().tobytes())
     return digest.hexdigest()[:16]
 

@@ -59,8 +59,8 @@ def plan_step(settings: TrainSettings, step: int, generator: torch.Generator) ->
     fraction = torch.rand(settings.clips, generator=generator) * perturbed
     ramp = settings.loss.published_from
     weight = 1.0 if ramp <= 0 else min(1.0, max(0.0, (step - ramp) / ramp))
-    return StepPlan(structure_only, fraction, weight, step % settings.score_every == 0,
-                    step % settings.unroll_every == 0)
+    train_scorer = settings.only == "scorer" or step % settings.score_every == 0
+    return StepPlan(structure_only, fraction, weight, train_scorer, step % settings.unroll_every == 0)
 
 
 class TrainingStep(nn.Module):

@@ -95,6 +95,9 @@ class Trainer:
         self.device = next(network.parameters()).device
         for part in ("inet", "scorer"):  # without instance norm, channels-last convolutions are twice as fast
             getattr(network.patchify, part).to(memory_format=torch.channels_last)
+        if settings.only == "scorer":
+            network.requires_grad_(False)
+            network.patchify.scorer.requires_grad_(True)
         self.module: nn.Module = TrainingStep(network, settings)
         if world > 1:
             devices = [self.device.index] if self.device.type == "cuda" else None
@@ -128,9 +131,7 @@ class Trainer:
         clips = self.source.batch(index).to(self.device)
         plan = plan_step(settings, self.step, generator_for(settings.seed, 3, index))
         self.network.train()
-        if settings.only == "scorer":
-            self.network.requires_grad_(False)
-        self.network.patchify.scorer.requires_grad_(plan.train_scorer or settings.only == "scorer")
+        self.network.patchify.scorer.requires_grad_(plan.train_scorer)
         losses = self.module(clips, plan)
         self.optimiser.zero_grad(set_to_none=True)
         self.scaler.scale(losses["total"]).backward()

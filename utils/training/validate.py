@@ -11,7 +11,8 @@ from devo.data_readers.base import TrainingClips
 from devo.enet import eVONet
 from devo.lietorch import SE3
 from devo.losses import alignment_scale, flow_errors, pose_errors
-from devo.unroll import UnrollResult, unroll_clips
+from devo.unroll import UnrollResult, UnrollStep, unroll_clips
+from devo.unroll_matching import MatchUpdate
 from devo.unroll_state import UnrollSettings
 from utils.training.step import last_score_loss
 
@@ -90,10 +91,10 @@ def _figures(network: eVONet, clips: TrainingClips, settings: ValidationSettings
     figures = {
         "flow": flow_errors(last.coords, last.coords_gt)[last.valid.bool()],
         "start": first.start_error[first.predicted_valid],
-        "first": (first.predicted - first.predicted_gt).norm(dim=-1)[first.predicted_valid],
-        "last": (last.predicted - last.predicted_gt).norm(dim=-1)[last.predicted_valid],
-        "probe": (probe.predicted - probe.predicted_gt).norm(dim=-1)[probe.predicted_valid],
-        "match": (match.predicted - match.predicted_gt).norm(dim=-1)[match.predicted_valid],
+        "first": _revision_errors(first),
+        "last": _revision_errors(last),
+        "probe": _revision_errors(probe),
+        "match": _revision_errors(match),
         "probe_length": (probe.predicted - probe.centre).norm(dim=-1)[probe.predicted_valid],
         "probe_true": (probe.predicted_gt - probe.centre).norm(dim=-1)[probe.predicted_valid],
         "confidence": last.weight[last.predicted_valid],
@@ -101,6 +102,11 @@ def _figures(network: eVONet, clips: TrainingClips, settings: ValidationSettings
     }
     figures["rotation"], figures["ate"] = _trajectory_errors(unrolled)
     return figures
+
+
+def _revision_errors(update: UnrollStep | MatchUpdate) -> Tensor:
+    """Errors of the revised centres of an update, edges that can be judged only [quarter-resolution px]."""
+    return (update.predicted - update.predicted_gt).norm(dim=-1)[update.predicted_valid]
 
 
 def _trajectory_errors(unrolled: UnrollResult) -> tuple[Tensor, Tensor]:
