@@ -46,6 +46,9 @@ DEFAULTS: dict[str, Any] = {
     # inverse depth of new patches before initialisation; 0 = random in (0,1) as published, which on scenes with little
     # relief often ends in the mirrored solution (scene and motion inverted)
     "INITIAL_INV_DEPTH": 0.5,
+    # before initialisation, a frame whose median flow since the last keyframe is below this is passed over
+    # [quarter-resolution px]; 8 frames above it are needed
+    "PROBE_FLOW": 2.0,
     # updates of the first structure, once enough keyframes are there
     "INITIAL_UPDATES": 12,
     # solve for the first structure twice, the second time from its reversed relief, and keep what explains more; False
@@ -63,7 +66,7 @@ DEFAULTS: dict[str, Any] = {
 _AT_LEAST = {
     "BUFFER_SIZE": 9, "PATCHES_PER_FRAME": 1, "REMOVAL_WINDOW": 1, "OPTIMIZATION_WINDOW": 1, "PATCH_LIFETIME": 1,
     "KEYFRAME_INDEX": 2, "KEYFRAME_THRESH": 0.0, "MOTION_DAMPING": 0.0, "RING_SIZE": 0,
-    "INITIAL_INV_DEPTH": 0.0, "INITIAL_UPDATES": 1,
+    "INITIAL_INV_DEPTH": 0.0, "INITIAL_UPDATES": 1, "PROBE_FLOW": 0.0,
 }
 _CHOICES = {"STILL_FRAMES": ("interpolate", "hold")}
 

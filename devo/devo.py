@@ -35,7 +35,6 @@ from devo.result import INITIAL_KEYFRAMES, LOST_AFTER, MIN_EVENT_SHARE, Tracking
 from devo.trajectory import FrameRecorder, accumulated_map, full_trajectory
 
 FINAL_UPDATES = 12
-PROBE_FLOW = 2.0  # quarter-resolution px of median flow that make a frame worth keeping before initialisation
 MIN_IMAGE_SIDE = 32
 EXPLAINED_PX = 4.0  # a measurement closer to its reprojection than this (quarter-resolution px) counts as explained
 _DAMPING = 1e-4
@@ -176,7 +175,7 @@ class DEVO(PatchGraph):
         self.ring.store(self.n, fmap, gmap, imap)
         self.counter += 1
         if self.n > 0 and not self.is_initialized:
-            threshold = PROBE_FLOW if scale == 1.0 else scale * scale
+            threshold = getattr(self.cfg, "PROBE_FLOW", 2.0) if scale == 1.0 else scale * scale
             if self.motion_probe() < threshold:
                 self.delta[self.counter - 1] = (self.counter - 2, _identity_pose(self.device))
                 self.still_frames.append(self.counter - 1)

@@ -67,7 +67,8 @@ def explain(status: TrackingStatus, counters: dict[str, int], keyframes: int) ->
                 f"{MIN_EVENT_SHARE:.0%} non-zero cells; try longer windows (--window_ms, --window_events)")
     if status is TrackingStatus.NOT_INITIALIZED:
         return (f"not initialised: {keyframes} of {INITIAL_KEYFRAMES} keyframes with enough motion in {accepted} "
-                "frames; try longer windows, a longer recording, or trained weights")
+                "frames; try longer windows, a longer recording, a lower PROBE_FLOW (--opts PROBE_FLOW 1) or trained "
+                "weights")
     if status is TrackingStatus.LOST:
         return (f"lost: the geometry no longer explains the measurements of the last {LOST_AFTER} of {accepted} frames "
                 f"({counters['ba_failures']} failed solves); try shorter windows or check the intrinsics")
