@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 MAX_SCALE = 10.0
-MIN_MATCHES = 2  # edges that a patch needs for a mean error
-MAX_RELATIVE = 20.0
+STRUCTURE_AT = 4.0  # times the mean event gradient of a frame: more does not count for more
 PEAK_SHARPNESS = 3.0  # logits per unit of correlation
 
 
@@ -87,48 +87,26 @@ def confidence_loss(
     return 0.5 * (weights * (error / scale).square() - weights.clamp(min=1e-6).log()).mean()
 
 
-def information_loss(
-    scores: Tensor, error: Tensor, valid: Tensor, kk: Tensor, limit: float = 4.0
-) -> tuple[Tensor, Tensor]:
-    """Teach the scorer how much a patch will tell: its score becomes the inverse of its expected squared error.
+def structure_loss(logits: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Teach the scorer where events have structure: its scores follow the event gradient, relative to the frame's mean.
 
-    mean of 2 * score * d - ln(score), d the mean squared matching error of a patch over the median of its frame. That
-    is smallest at score = 1 / (2 E[d]): a patch as good as the median gets 1/2, whatever the clip's motion, whereas the
-    published loss (`score_loss`) compares with one pixel, so that all scores go to 1 once errors are well below it.
+    Cross entropy with min(1, gradient / (`STRUCTURE_AT` * mean)). Patches drawn with these scores lie on edges. The
+    published loss (`score_loss`) compares errors with one pixel: once errors are well below, all scores go to 1 and
+    patches are drawn evenly; how well a single patch will be matched can hardly be foreseen from its few pixels.
 
     Args:
-        scores: (frames, M) in (0,1), patch-major order as in `kk`.
-        error: (1,E) matching error, quarter-resolution pixels; no gradient flows into it.
-        valid: (1,E) bool.
-        kk: (E,) patch of each edge.
-        limit: larger errors count as this [pixels].
+        logits: (N,rows,columns) of `devo.selector.Scorer`; cell s stands for quarter-resolution pixel s+1.
+        gradient: (N,h,w) of `devo.selector.event_gradient` of the same frames; cell s stands for pixel s.
 
     Returns:
-        the loss, and the rank correlation between score and -d within frames (mean over frames), a figure to watch.
+        the loss, and the correlation between scores and their targets (over all cells), a figure to watch.
     """
-    with torch.no_grad():
-        used = valid[0].to(error.dtype)
-        count = torch.zeros(scores.numel(), device=error.device, dtype=error.dtype).index_add_(0, kk, used)
-        squared = torch.where(valid[0], error[0].clamp(max=limit).square(), 0.0)
-        total = torch.zeros_like(count).index_add_(0, kk, squared)
-        known = (count >= MIN_MATCHES).view_as(scores)
-        mean = torch.where(known, (total / count.clamp(min=1)).view_as(scores), torch.nan)
-        relative = mean / mean.nanmedian(dim=1, keepdim=True).values.clamp(min=1e-6)
-        known = known & relative.isfinite()
-        relative = torch.where(known, relative, 0.0).clamp(max=MAX_RELATIVE)
-        correlation = _rank_correlation(scores.detach(), -relative, known)
-    loss = 2.0 * scores * relative - scores.clamp(min=1e-6).log()
-    return masked_mean(loss, known), correlation
-
-
-def _rank_correlation(first: Tensor, second: Tensor, known: Tensor) -> Tensor:
-    """Spearman's correlation of rows (F,M) over their known entries, mean over rows with enough of them."""
-    rows = [
-        torch.corrcoef(torch.stack([x[mask].argsort().argsort().float() for x in (a, b)]))[0, 1]
-        for a, b, mask in zip(first, second, known)
-        if int(mask.sum()) > MIN_MATCHES
-    ]
-    return torch.stack(rows).nanmean() if rows else first.new_zeros(())
+    rows, columns = logits.shape[-2:]
+    mean = gradient.mean(dim=(1, 2), keepdim=True).clamp(min=1e-6)
+    target = (gradient / (STRUCTURE_AT * mean)).clamp(max=1.0)[:, 1 : rows + 1, 1 : columns + 1]
+    loss = F.binary_cross_entropy_with_logits(logits, target)
+    pairs = torch.stack([torch.sigmoid(logits.detach()).flatten(), target.flatten()])
+    return loss, torch.corrcoef(pairs)[0, 1]
 
 
 def peak_loss(correlation: Tensor, centre: Tensor, coords_gt: Tensor, valid: Tensor) -> Tensor:

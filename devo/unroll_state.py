@@ -44,7 +44,6 @@ class UnrollSettings:
         probe: also run one update from a zero state on single edges between two frames, as the tracker's start-up does.
         match_updates: also run so many updates on edges that start off the truth, each in its own way.
         depth_noise: chance, per update, that the inverse depths of half of the patches are disturbed after it.
-        uniform_patches: draw patches uniformly, not by their scores; the scores are still reported.
         mixed_precision: None (float32) or the type of autocast for encoders and update operator.
     """
 
@@ -62,7 +61,6 @@ class UnrollSettings:
     probe: bool = False
     match_updates: int = 0
     depth_noise: float = 0.0
-    uniform_patches: bool = False
     mixed_precision: torch.dtype | None = None
 
 
@@ -82,9 +80,8 @@ class JoinedClips:
         flat = self.clips * self.frames
         disps = disps[..., 1::4, 1::4]
         with self.autocast():
-            chosen = {"coords": self._uniform_coords(disps)} if settings.uniform_patches else {}
             fmap, gmap, imap, patches, _, *rest = network.patchify(
-                images, patches_per_image=self.per_frame, disps=disps, **chosen
+                images, patches_per_image=self.per_frame, disps=disps
             )
         self.scores: Tensor | None = rest[0] if rest else None
         self.height, self.width = fmap.shape[-2:]
@@ -101,13 +98,6 @@ class JoinedClips:
         relative = SE3(world) * SE3(world[:, :1]).inv()  # the first frame of each clip is its world frame
         self.poses_gt = SE3(relative.data.reshape(1, flat, 7))
         self.poses = self.poses_gt
-
-    def _uniform_coords(self, disps: Tensor) -> Tensor:
-        """Patch centres (B*n,M,2), quarter-resolution pixels, anywhere in the image but not at its edge."""
-        height, width = disps.shape[-2:]
-        sides = torch.tensor([width - 2, height - 2], dtype=torch.float32)
-        drawn = 1 + torch.floor(torch.rand(self.clips * self.frames, self.per_frame, 2) * sides)
-        return drawn.to(disps.device)
 
     def autocast(self) -> contextlib.AbstractContextManager[object]:
         """Lower precision for encoders and update operator, if asked for."""

@@ -55,8 +55,8 @@ class TrainSettings:
 
     Attributes:
         dim_inet, dim_fnet, dim, norm: network.
-        only: "scorer" trains the scorer alone, on the errors with which the network (as it is) matches patches drawn
-            uniformly, see `devo.losses.information_loss`; "" trains everything.
+        only: "scorer" trains the scorer alone, to find the structure of the frames, see `devo.losses.structure_loss`;
+            "" trains everything.
         patches: patches per frame. frames: frames per clip. updates: updates per step. initial_frames: dense start.
         clips: clips per step. sizes: (height, width) windows, one drawn per step.
         structure_only: probability, per step, that poses stay at the truth.

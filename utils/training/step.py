@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from devo.data_readers.base import TrainingClips
 from devo.enet import eVONet
 from devo.errors import InputError
+from devo.extractor import channels_last_frames
 from devo.lietorch import SE3
 from devo.losses import (
     confidence_loss,
@@ -18,13 +19,14 @@ from devo.losses import (
     fine_loss,
     flow_errors,
     flow_loss,
-    information_loss,
     masked_mean,
     peak_loss,
     pose_loss,
     same_direction,
     score_loss,
+    structure_loss,
 )
+from devo.selector import event_gradient
 from devo.unroll import UnrollResult, UnrollStep, prepare_images, unroll_clips
 from devo.unroll_matching import MatchUpdate
 from devo.unroll_state import UnrollSettings
@@ -91,9 +93,9 @@ class TrainingStep(nn.Module):
     def forward(self, clips: TrainingClips, plan: StepPlan) -> dict[str, Tensor]:
         """Total loss (key `total`) and its parts (without gradient) for a batch on the network's device."""
         images = prepare_images(self.network, clips.voxels)
-        poses = SE3(clips.world_T_cam).inv()
         if self.settings.only == "scorer":
-            return self._scorer_loss(clips, images, poses)
+            return self._scorer_loss(images)
+        poses = SE3(clips.world_T_cam).inv()
         result = unroll_clips(
             self.network,
             images,
@@ -105,21 +107,14 @@ class TrainingStep(nn.Module):
         )
         return total_loss(result, self.settings.loss, plan)
 
-    def _scorer_loss(self, clips: TrainingClips, images: Tensor, poses: SE3) -> dict[str, Tensor]:
-        """How well the scorer foresees the matching errors of patches drawn uniformly."""
-        settings = UnrollSettings(
-            steps=0,
-            patches_per_image=self.settings.patches,
-            match_updates=max(1, self.settings.match_updates),
-            uniform_patches=True,
-        )
-        result = unroll_clips(self.network, images, poses, clips.inv_depths, clips.intrinsics, settings)
-        match = result.matches[-1]
-        if result.scores is None:
+    def _scorer_loss(self, images: Tensor) -> dict[str, Tensor]:
+        """How well the scorer finds the structure of the frames."""
+        scorer = getattr(self.network.patchify, "scorer", None)
+        if scorer is None:
             raise InputError("this network has no scorer to train")
-        error = (match.predicted - match.predicted_gt).norm(dim=-1)
-        loss, correlation = information_loss(result.scores, error, match.predicted_valid, match.kk)
-        return {"total": loss, "scores": loss.detach(), "score_rank": correlation}
+        frames = channels_last_frames(images)
+        loss, correlation = structure_loss(scorer.rate(frames), event_gradient(frames))
+        return {"total": loss, "scores": loss.detach(), "score_correlation": correlation}
 
 
 def total_loss(result: UnrollResult, weights: LossSettings, plan: StepPlan) -> dict[str, Tensor]:

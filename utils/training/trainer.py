@@ -47,7 +47,7 @@ LOG_NAMES = (
     "flow_last",
     "pose",
     "scores",
-    "score_rank",
+    "score_correlation",
     "fine",
     "confidence",
 )
