@@ -61,6 +61,9 @@ SIMULATOR_SURFACE = 3e-6  # back-projected depth, distance from the scene over t
 SIMULATOR_CROSSING = 1e-5  # log intensity at the time of an event against a float64 pixel; observed 1.7e-6
 SIMULATOR_VOXEL = 1e-5  # voxel cells against float64 binning of listed events; observed 1.4e-6
 
+# --- COLMAP --------------------------------------------------------------------------------------------------
+COLMAP_FRAMES = 1e-4  # camera centres tracked from frames as files against those from the recording; 1.9e-5 of 10
+
 # --- EMVS ---------------------------------------------------------------------------------------------------
 EMVS_VOTES = 3e-5  # per voxel, float32 positions against float64 rays; 7.4e-6 (24 draws)
 EMVS_VOTES_NEAR_PLANES = 2e-4  # the same with cameras among the planes; 5.2e-5 (12 draws)
