@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from devo.errors import TrackingError
 from evals.image_metrics import DepthErrors, EdgeAgreement, Projection, edge_agreement, project
-from evals.pointcloud_metrics import PlaneFit, nearest_distances
+from evals.pointcloud_metrics import PlaneFit, import_open3d, nearest_distances
 from evals.validation.agreement import (
     Agreement,
     Planarity,
@@ -161,6 +161,7 @@ def validate(settings: ValidationSettings) -> Validation:
         TrackingError: the odometry gave nothing usable.
     """
     clock = _Clock()
+    import_open3d()  # better missing now than after ten minutes
     settings = settings.resolved()
     source = open_source(settings)
     trials = run_trials(settings)

@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import re
+import sys
 from pathlib import Path
 
 import cv2
@@ -338,3 +339,10 @@ def test_a_run_too_short_to_start_is_an_error_and_remembered(folder: Path, tmp_p
     with pytest.raises(TrackingError, match="not initialised"):
         odometry.run_trials(settings)
     assert json.loads((tmp_path / "odometry" / "seed0.json").read_text("utf-8"))["status"] == facts["status"]
+
+
+def test_missing_open3d_is_noticed_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)  # importing it raises
+    monkeypatch.setattr(experiment, "run_trials", lambda _: pytest.fail("too late"))
+    with pytest.raises(InputError, match="ICP needs Open3D"):
+        validate(ValidationSettings(sequence=tmp_path, out=tmp_path / "report"))
