@@ -4,7 +4,8 @@
 Example: python evals/validate_pointcloud.py --sequence datasets/board
 
 Needs a recording with ground truth: a simulated one (python scripts/simulate.py --scene board --out datasets/board
---seconds 8 --seed 1), a generic folder with groundtruth.txt, or a preprocessed sequence, for example of VECtor.
+--seconds 8 --seed 1), a generic folder with groundtruth.txt, or a preprocessed sequence of a data set that publishes
+the poses of its event camera: VECtor, for example, but neither TUM-VIE nor EDS.
 Open validation.html in the report folder. Trials of the odometry are kept there and reused by the next run.
 """
 

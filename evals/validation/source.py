@@ -11,6 +11,7 @@ import numpy.typing as npt
 from devo.errors import InputError
 from evals.validation.settings import ValidationSettings
 from utils.datasets.files import read_image_list
+from utils.datasets.recognise import GENERIC, preprocessing_command
 from utils.datasets.registry import open_sequence
 from utils.datasets.sequence import Sequence, read_image
 from utils.emvs.geometry import FloatArray
@@ -23,6 +24,10 @@ from utils.undistort import undistort_image
 
 _READ_EVENTS = 1 << 19
 _PICTURE_EVENTS_PER_PIXEL = 0.6  # about as many as draw every edge once
+_POSES_OF = {("eds", "left"): "motion capture body", ("eds", "right"): "motion capture body",
+             ("tumvie", "left"): "motion capture body", ("tumvie", "right"): "motion capture body",
+             ("mvsec", "right"): "left camera"}
+"""Whose poses data sets publish where it is not the event camera: (data set, side) -> what."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,25 +155,22 @@ class Source:
         if not poses.is_file():
             return np.eye(4)
         gray, event = PoseTrack(read_tum(poses, time_unit="us")), PoseTrack(self.truth)
-        return np.linalg.inv(event(t_us)[0]) @ gray(t_us)[0]
+        # at a stamp of both files: between two of them each camera is taken to move straight, so the rig would bend
+        stamp_us = self.truth.t_us[np.abs(self.truth.t_us - t_us).argmin()]
+        return np.linalg.inv(event(stamp_us)[0]) @ gray(stamp_us)[0]
 
 
 def open_source(settings: ValidationSettings) -> Source:
     """Open the recording of a validation.
 
     Raises:
-        InputError: it cannot be read, or has no ground truth or fewer than two poses.
+        InputError: it cannot be read, or has no ground truth of its event camera or fewer than two poses.
     """
+    settings = settings.resolved()  # the errors depend on the data set
     sequence = open_sequence(settings.dataset, settings.sequence, settings.sequence_options())
     if not isinstance(sequence, Sequence):
         raise InputError(f"{settings.sequence}: the recording holds ready-made voxel grids, but EMVS needs its events")
-    found = sequence.ground_truth()
-    if found is None:
-        raise InputError(f"{settings.sequence}: no ground truth; the validation compares maps made with true poses, so "
-                         "it needs groundtruth.txt (TUM text, camera to world, metres)")
-    truth = Trajectory(*found)
-    if len(truth) < 2:
-        raise InputError(f"{settings.sequence}: the ground truth has {len(truth)} pose(s), expected at least 2")
+    truth = _true_poses(settings, sequence)
     width, height = sequence.sensor_size
     positions = sequence.rectify_map
     notes: list[str] = []
@@ -181,6 +183,31 @@ def open_source(settings: ValidationSettings) -> Source:
         if (settings.sequence / "depth").is_dir():
             notes.append("The depth maps show the distorted camera and are not used.")
     return Source(sequence, truth, EventCamera(positions, sequence.intrinsics), depth, tuple(notes))
+
+
+def _true_poses(settings: ValidationSettings, sequence: Sequence) -> Trajectory:
+    """Ground truth of the event camera.
+
+    Raises:
+        InputError: there is none, or it is that of another body.
+    """
+    folder, dataset = settings.sequence, settings.dataset
+    owner = _POSES_OF.get((dataset, settings.side))
+    if owner is not None:
+        raise InputError(f"{folder}: the ground truth of {dataset} is that of the {owner}, but maps made with true poses "
+                         f"need those of the {settings.side} event camera; convert them and read the events as a "
+                         f"recording of your own (--dataset {GENERIC}, groundtruth.txt)")
+    found = sequence.ground_truth()
+    if found is None:
+        way = ("groundtruth.txt (TUM text, camera to world, metres)" if dataset == GENERIC else
+               f"the poses that come with {dataset}: put their file beside the events and run "
+               f"`{preprocessing_command(dataset, folder, settings.side)}`")
+        raise InputError(f"{folder}: no ground truth; the validation compares maps made with true poses, so it needs "
+                         f"{way}")
+    truth = Trajectory(*found)
+    if len(truth) < 2:
+        raise InputError(f"{folder}: the ground truth has {len(truth)} pose(s), expected at least 2")
+    return truth
 
 
 def _find_depth(folder: Path, intrinsics: FloatArray) -> DepthMaps | None:

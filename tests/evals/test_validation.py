@@ -21,7 +21,7 @@ from devo.poses import matrix_to_pose
 from evals.validation import Validation, ValidationSettings, experiment, odometry, paper, validate, write_report
 from evals.validation.agreement import compare, planarity
 from evals.validation.experiment import CLEANED, EMVS_TRUE, TrialSummary
-from evals.validation.figures import draw_trajectory
+from evals.validation.figures import all_figures, draw_trajectory
 from evals.validation.mapping import MapResult, align, mask_agreement, points_with_radius
 from evals.validation.odometry import Trial
 from evals.validation.report import save_figure
@@ -203,6 +203,24 @@ def test_same_figures_same_bytes(report: Path, perfect: Validation) -> None:
     again = io.BytesIO()
     save_figure(draw_trajectory(perfect), again)
     assert (report / "figures" / "trajectory.png").read_bytes() == again.getvalue()
+
+
+@pytest.mark.parametrize("name", all_figures())
+def test_nothing_of_a_figure_is_cut_off_or_overlaps(perfect: Validation, name: str) -> None:
+    """As it is written, with point counts as those of a large sensor."""
+    grown = {cloud: np.repeat(points, 1 + 30_000 // len(points), axis=0) for cloud, points in perfect.points.items()}
+    projections = {cloud: dataclasses.replace(found, **{
+        one.name: np.repeat(getattr(found, one.name), 1 + 30_000 // len(found.inside), axis=0)
+        for one in dataclasses.fields(found)}) for cloud, found in perfect.projections.items()}
+    figure = all_figures()[name][1](dataclasses.replace(perfect, points=grown, projections=projections))
+    save_figure(figure, io.BytesIO())
+    figure.dpi = 130  # as it is written, because the width of text depends on it
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]  # of the canvas of Agg
+    box, page = figure.get_tightbbox(renderer), figure.get_size_inches()
+    assert min(box.x0, box.y0, page[0] - box.x1, page[1] - box.y1) > -0.01, "inches"
+    titles = sorted((axes._left_title.get_window_extent(renderer) for axes in figure.axes if axes.get_title("left")),
+                    key=lambda extent: extent.x0)
+    assert not any(first.overlaps(second) for first, second in zip(titles, titles[1:]))
 
 
 def test_a_table_in_its_three_forms() -> None:
