@@ -62,7 +62,9 @@ def _styled(draw: Callable[[Validation], Figure]) -> Callable[[Validation], Figu
         import matplotlib
 
         with matplotlib.rc_context(_STYLE):
-            return draw(found)
+            figure = draw(found)
+            figure.draw_without_rendering()  # the layout settles in its second pass where panels keep their aspect
+        return figure
 
     return styled
 
@@ -109,8 +111,8 @@ def draw_image_overlay(found: Validation) -> Figure:
         pixel = projection.pixel_xy[projection.inside]
         panel.scatter(*pixel.T, s=5, color=COLORS[name], linewidths=0, alpha=0.9)
         edge = found.edges.get(name)
-        text = f"{name}: {len(pixel)} points"
-        panel.set_title(text + (f", {edge.mean_distance_px:.1f} px from edges (random {edge.random_distance_px:.1f})"
+        text = f"{name}: {len(pixel)} points"  # two lines, because one does not fit over a panel for large images
+        panel.set_title(text + (f"\n{edge.mean_distance_px:.1f} px from edges (random {edge.random_distance_px:.1f})"
                                 if edge else ""), fontsize=9.5)
         panel.set_xlim(-0.5, image.shape[1] - 0.5)
         panel.set_ylim(image.shape[0] - 0.5, -0.5)

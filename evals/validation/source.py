@@ -194,9 +194,9 @@ def _true_poses(settings: ValidationSettings, sequence: Sequence) -> Trajectory:
     folder, dataset = settings.sequence, settings.dataset
     owner = _POSES_OF.get((dataset, settings.side))
     if owner is not None:
-        raise InputError(f"{folder}: the ground truth of {dataset} is that of the {owner}, but maps made with true poses "
-                         f"need those of the {settings.side} event camera; convert them and read the events as a "
-                         f"recording of your own (--dataset {GENERIC}, groundtruth.txt)")
+        raise InputError(f"{folder}: the ground truth of {dataset} is that of the {owner}, but maps made with true "
+                         f"poses need those of the {settings.side} event camera; convert them and read the events as "
+                         f"a recording of your own (--dataset {GENERIC}, groundtruth.txt)")
     found = sequence.ground_truth()
     if found is None:
         way = ("groundtruth.txt (TUM text, camera to world, metres)" if dataset == GENERIC else

@@ -69,8 +69,8 @@ def is_planar(found: Validation) -> bool:
 def _no_plane(found: Validation) -> str:
     """Why flatness is not judged: the scene may be round, or the map of a flat one too scattered to tell."""
     share = found.planarities[EMVS_TRUE].robust.inlier_share
-    return (f"not known to be flat: {share:.1%} of the points of EMVS (true poses) lie within {PLANE_SHARE:.0%} of the "
-            f"distance from one plane, {_PLANAR_SHARE:.0%} would tell")
+    return (f"the scene is not known to be flat: {share:.1%} of the points of EMVS (true poses) lie within "
+            f"{PLANE_SHARE:.0%} of the distance from one plane, at least {_PLANAR_SHARE:.0%} are needed to judge it")
 
 
 def _map_criteria(found: Validation) -> Iterator[Criterion]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.tolerances import COLMAP_FRAMES
+from utils.colmap.model import PIXEL_CENTER
 from utils.datasets.registry import SequenceOptions, open_sequence
 from utils.simulator.dataset_folder import FolderOptions, write_recording
 from utils.simulator.sequence import SequenceSettings
@@ -30,7 +31,7 @@ def run(*arguments: object) -> str:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("colmap") / "board"
     settings = SequenceSettings(seconds=0.8, scene="board", seed=3, preset="fast", size=(160, 120))
-    write_recording(folder, settings, FolderOptions(depth=False))
+    write_recording(folder, settings, FolderOptions(depth=False, frames=True))
     return folder
 
 
@@ -70,3 +71,23 @@ def test_recording_and_frames_give_the_same_model(recording: Path, tmp_path: Pat
     np.testing.assert_allclose(poses(first), poses(second), atol=COLMAP_FRAMES)
     assert first.compute_mean_reprojection_error() == pytest.approx(second.compute_mean_reprojection_error(), rel=1e-4)
     assert 0.0 < first.compute_mean_reprojection_error() < 2.0
+
+
+def test_images_keep_their_names_and_a_smaller_camera(recording: Path, tmp_path: Path) -> None:
+    """Every second image at half its size, read back as text. There are no small weights for images, so the network is
+    untrained: its path means nothing, and neither motion nor small errors are asked for."""
+    pycolmap = pytest.importorskip("pycolmap", reason="the reader of COLMAP models is not installed")
+    (tmp_path / "still.yaml").write_text("PATCHES_PER_FRAME: 8\nPROBE_FLOW: 0.0\nKEYFRAME_THRESH: 0.0\n")
+    text = run("--input", recording / "images", "--mode", "rgb", "--timestamps", recording / "images_timestamps_us.txt",
+               "--intrinsics-file", recording / "calib.yaml", "--width", 160, "--height", 120, "--stride", 2,
+               "--scale", 0.5, "--weights", "random:0:16,16,8:rgb", "--config", tmp_path / "still.yaml",
+               "--max-error-px", 1000, "--colmap-dir", tmp_path / "model")
+    found = pycolmap.Reconstruction(str(tmp_path / "model"))
+    files = sorted(path.name for path in (recording / "images").iterdir())
+    assert sorted(image.name for image in found.images.values()) == files[::2]
+    camera = found.cameras[1]
+    assert (camera.width, camera.height) == (80, 60)
+    intrinsics = 0.5 * open_sequence("generic", recording, SequenceOptions()).intrinsics
+    np.testing.assert_allclose(camera.params, intrinsics + [0, 0, PIXEL_CENTER, PIXEL_CENTER])
+    assert f"{len(files[::2])} images" in text and found.num_points3D() > 0
+    assert all(np.ptp(point.color) == 0 for point in found.points3D.values())  # the frames are gray
