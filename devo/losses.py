@@ -8,6 +8,7 @@ from torch import Tensor
 
 MAX_SCALE = 10.0
 STRUCTURE_AT = 4.0  # times the mean event gradient of a frame: more does not count for more
+LEAST_SCORE = 0.2  # so that about every second patch is drawn evenly: all on the strongest edges, they see one surface
 PEAK_SHARPNESS = 3.0  # logits per unit of correlation
 
 
@@ -90,9 +91,10 @@ def confidence_loss(
 def structure_loss(logits: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
     """Teach the scorer where events have structure: its scores follow the event gradient, relative to the frame's mean.
 
-    Cross entropy with min(1, gradient / (`STRUCTURE_AT` * mean)). Patches drawn with these scores lie on edges. The
-    published loss (`score_loss`) compares errors with one pixel: once errors are well below, all scores go to 1 and
-    patches are drawn evenly; how well a single patch will be matched can hardly be foreseen from its few pixels.
+    Cross entropy with t = min(1, gradient / (`STRUCTURE_AT` * mean)), raised to `LEAST_SCORE` + (1 - `LEAST_SCORE`) t.
+    Patches drawn with these scores prefer edges without leaving the rest of the image empty. The published loss
+    (`score_loss`) compares errors with one pixel: once they are well below, all scores go to 1 and patches are drawn
+    evenly; how well a single patch will be matched can hardly be foreseen from its few pixels.
 
     Args:
         logits: (N,rows,columns) of `devo.selector.Scorer`; cell s stands for quarter-resolution pixel s+1.
@@ -104,6 +106,7 @@ def structure_loss(logits: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
     rows, columns = logits.shape[-2:]
     mean = gradient.mean(dim=(1, 2), keepdim=True).clamp(min=1e-6)
     target = (gradient / (STRUCTURE_AT * mean)).clamp(max=1.0)[:, 1 : rows + 1, 1 : columns + 1]
+    target = LEAST_SCORE + (1.0 - LEAST_SCORE) * target
     loss = F.binary_cross_entropy_with_logits(logits, target)
     pairs = torch.stack([torch.sigmoid(logits.detach()).flatten(), target.flatten()])
     return loss, torch.corrcoef(pairs)[0, 1]
