@@ -74,8 +74,6 @@ class UnrollResult(NamedTuple):
     """Start-up matching, see `UnrollSettings.probe`."""
     matches: list[MatchUpdate]
     """Updates of edges that start away from the truth, see `UnrollSettings.match_updates`."""
-    scores: Tensor | None
-    """(B*n,M) score of each patch, with gradient where the scorer has one."""
 
 
 def unroll(
@@ -136,7 +134,7 @@ def unroll_clips(
     probe = match_frames(clips) if settings.probe and several else None
     matches = match_offsets(clips, settings.match_updates) if settings.match_updates and several else []
     if settings.steps == 0:
-        return UnrollResult([], truth, probe, matches, clips.scores)
+        return UnrollResult([], truth, probe, matches)
     if not settings.structure_only:
         clips.poses = clips.start_poses(start_fraction)
     graph = GrowingGraph(clips)
@@ -151,7 +149,7 @@ def unroll_clips(
         clips.poses, clips.patches = clips.poses.detach(), clips.patches.detach()
         if not last and float(torch.rand(())) < settings.depth_noise:
             clips.disturb_depths()
-    return UnrollResult(steps, truth, probe, matches, clips.scores)
+    return UnrollResult(steps, truth, probe, matches)
 
 
 def _one_update(clips: JoinedClips, graph: GrowingGraph, differentiable: bool, match: bool, last: bool) -> UnrollStep:

@@ -31,8 +31,6 @@ class MatchUpdate(NamedTuple):
     """(1,E,2) patch centre before the revision."""
     weight: Tensor
     """(1,E,2) confidence."""
-    kk: Tensor
-    """(E,) patch of each edge."""
     correlation: Tensor
     """(1,E,7,7) correlation of the patch at shifts (x, y) of -3..3 pixels from the centre, mean over its pixels."""
 
@@ -98,8 +96,6 @@ def _updates(
         centre = coords[:, :, middle, middle]
         side = 2 * clips.correlate.radius + 1
         finest = corr.float().view(1, -1, side, side, coords.shape[2] ** 2, len(clips.correlate.levels))[..., 0]
-        steps.append(
-            MatchUpdate(centre + delta, centre_gt, visible, centre, weight, edges[2], finest.mean(dim=-1))
-        )
+        steps.append(MatchUpdate(centre + delta, centre_gt, visible, centre, weight, finest.mean(dim=-1)))
         coords = coords + delta.detach()[:, :, None, None]
     return steps
