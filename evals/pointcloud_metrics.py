@@ -7,16 +7,16 @@ result; `PointCloud.finite_mask` and `select` remove them.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from devo.errors import InputError
 from evals.alignment import Similarity
+from utils.clouds.open3d_import import import_open3d
 
+ICP_REMEDY = "install it and the system library it names, ICP needs it"
 _BATCH = 2_000_000  # distances per step of the plane search: 16 MB
 
 
@@ -218,7 +218,7 @@ def icp(
     if not (nearest_distances(source, target) <= max_distance).any():
         raise InputError(f"no source point has a target point within {max_distance:g}; align the clouds roughly first "
                          "or raise the limit")
-    open3d = import_open3d()
+    open3d = import_open3d(ICP_REMEDY)
     registration = open3d.pipelines.registration
     clouds = [open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)) for points in (source, target)]
     outcome = registration.registration_icp(
@@ -231,19 +231,6 @@ def icp(
     transform = Similarity(scale, block / scale, np.array(outcome.transformation[:3, 3]))
     return IcpResult(transform, float(outcome.fitness), float(outcome.inlier_rmse), transform.angle_deg(),
                      float(np.linalg.norm(transform.translation)))
-
-
-def import_open3d() -> Any:
-    """The Open3D module, which `icp` needs; long experiments call this first to fail early.
-
-    Raises:
-        InputError: it cannot be imported.
-    """
-    try:
-        return importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
-        raise InputError(f"ICP needs Open3D, which cannot be imported ({error}); install it and the system library "
-                         "it names") from error
 
 
 def _checked(points: np.ndarray, name: str, least: int = 1) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from devo.errors import TrackingError
 from evals.image_metrics import DepthErrors, EdgeAgreement, Projection, edge_agreement, project
-from evals.pointcloud_metrics import PlaneFit, import_open3d, nearest_distances
+from evals.pointcloud_metrics import ICP_REMEDY, PlaneFit, nearest_distances
 from evals.validation.agreement import (
     Agreement,
     Planarity,
@@ -34,6 +34,7 @@ from evals.validation.settings import SHARES_OF_DISTANCE, THRESHOLDS_M, Validati
 from evals.validation.source import Picture, Source, open_source
 from utils.clouds.cloud import PointCloud
 from utils.clouds.filters import FilterReport
+from utils.clouds.open3d_import import import_open3d
 from utils.emvs.geometry import FloatArray
 from utils.emvs.views import PoseTrack
 
@@ -161,7 +162,7 @@ def validate(settings: ValidationSettings) -> Validation:
         TrackingError: the odometry gave nothing usable.
     """
     clock = _Clock()
-    import_open3d()  # better missing now than after ten minutes
+    import_open3d(ICP_REMEDY)  # better missing now than after ten minutes
     settings = settings.resolved()
     source = open_source(settings)
     trials = run_trials(settings)

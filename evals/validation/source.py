@@ -24,10 +24,6 @@ from utils.undistort import undistort_image
 
 _READ_EVENTS = 1 << 19
 _PICTURE_EVENTS_PER_PIXEL = 0.6  # about as many as draw every edge once
-_POSES_OF = {("eds", "left"): "motion capture body", ("eds", "right"): "motion capture body",
-             ("tumvie", "left"): "motion capture body", ("tumvie", "right"): "motion capture body",
-             ("mvsec", "right"): "left camera"}
-"""Whose poses data sets publish where it is not the event camera: (data set, side) -> what."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,11 +188,10 @@ def _true_poses(settings: ValidationSettings, sequence: Sequence) -> Trajectory:
         InputError: there is none, or it is that of another body.
     """
     folder, dataset = settings.sequence, settings.dataset
-    owner = _POSES_OF.get((dataset, settings.side))
-    if owner is not None:
-        raise InputError(f"{folder}: the ground truth of {dataset} is that of the {owner}, but maps made with true "
-                         f"poses need those of the {settings.side} event camera; convert them and read the events as "
-                         f"a recording of your own (--dataset {GENERIC}, groundtruth.txt)")
+    if sequence.poses_of is not None:
+        raise InputError(f"{folder}: the ground truth of {dataset} is that of the {sequence.poses_of}, but maps made "
+                         f"with true poses need those of the {settings.side} event camera; convert them and read the "
+                         f"events as a recording of your own (--dataset {GENERIC}, groundtruth.txt)")
     found = sequence.ground_truth()
     if found is None:
         way = ("groundtruth.txt (TUM text, camera to world, metres)" if dataset == GENERIC else

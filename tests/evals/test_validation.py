@@ -362,5 +362,5 @@ def test_a_run_too_short_to_start_is_an_error_and_remembered(folder: Path, tmp_p
 def test_missing_open3d_is_noticed_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "open3d", None)  # importing it raises
     monkeypatch.setattr(experiment, "run_trials", lambda _: pytest.fail("too late"))
-    with pytest.raises(InputError, match="ICP needs Open3D"):
+    with pytest.raises(InputError, match="ICP needs it"):
         validate(ValidationSettings(sequence=tmp_path, out=tmp_path / "report"))

@@ -281,7 +281,7 @@ def test_without_open3d_the_same_points_stay(monkeypatch: pytest.MonkeyPatch) ->
             raise ImportError("libusb-1.0.so.0: cannot open shared object file")
         return real(name, *rest)
 
-    monkeypatch.setattr("utils.clouds.filters.importlib.import_module", without_open3d)
+    monkeypatch.setattr("utils.clouds.open3d_import.importlib.import_module", without_open3d)
     keep, report = statistical_outlier(cloud)
     np.testing.assert_array_equal(keep, expected)
     assert report.parameters["backend"] == "scipy"

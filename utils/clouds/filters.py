@@ -8,7 +8,6 @@ nearest-neighbour distance.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 
 from devo.errors import InputError
 from utils.clouds.cloud import PointCloud
+from utils.clouds.open3d_import import import_open3d
 
 Value = float | int | str | None
 
@@ -352,11 +352,11 @@ def _backend(wanted: str) -> str:
     if wanted == "scipy":
         return wanted
     try:
-        importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
+        import_open3d("install it and the system library it names, or choose the scipy backend, which follows the same "
+                      "rule")
+    except InputError:
         if wanted == "open3d":
-            raise InputError(f"Open3D cannot be imported ({error}); install it and the system library it names, "
-                             "or choose the scipy backend, which follows the same rule") from error
+            raise
         return "scipy"
     return "open3d"
 

@@ -117,7 +117,8 @@ def open_eds(path: Path, options: SequenceOptions, voxel_size: tuple[int, int] |
         hot_pixel_stds=HOT_PIXEL_STDS,
         images=find_images(path / f"images_undistorted_{calibration}", all_stamps,
                            lambda: undistorted_camera(path, calibration, "rgb"), command),
-        read_ground_truth=poses_reader(poses, skip_lines=1), files=files, voxel_size=voxel_size)
+        read_ground_truth=poses_reader(poses, skip_lines=1), poses_of="motion capture body", files=files,
+        voxel_size=voxel_size)
 
 
 def undistorted_camera(path: Path, calibration: str, camera: str) -> npt.NDArray[np.float64]:

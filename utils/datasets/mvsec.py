@@ -87,7 +87,8 @@ def open_mvsec(path: Path, options: SequenceOptions, voxel_size: tuple[int, int]
         windows=RowWindows(rows, stamps), rectify_map=read_rectify_map(files["rectify map"], SIZE),
         images=find_images(path / f"images_undistorted_{side}", stamps,
                            lambda: read_pinhole(files["intrinsics"], SIZE), command),
-        read_ground_truth=(lambda: read_poses(poses)) if poses.is_file() else None, files=files, voxel_size=voxel_size)
+        read_ground_truth=(lambda: read_poses(poses)) if poses.is_file() else None,
+        poses_of="left camera" if side == "right" else None, files=files, voxel_size=voxel_size)
 
 
 def read_array(path: Path, name: str) -> npt.NDArray[Any]:

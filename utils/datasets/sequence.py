@@ -61,6 +61,7 @@ class Recording(abc.ABC):
         images: image files, or one line that says why there are none.
         voxel_size: (width, height) of the voxel grids, None for the size of the sensor; intrinsics are scaled along.
         read_ground_truth: returns stamps (N,) in microseconds and camera-to-world poses (N, 7); None without any.
+        poses_of: whose poses the ground truth is, None for the event camera's.
         files: files in use by role, for reports.
 
     Attributes:
@@ -77,8 +78,8 @@ class Recording(abc.ABC):
 
     def __init__(self, name: str, path: Path, options: SequenceOptions, *, size: tuple[int, int],
                  intrinsics: npt.ArrayLike, images: ImageFiles | str | None = None,
-                 read_ground_truth: Callable[[], GroundTruth] | None = None, files: dict[str, Path] | None = None,
-                 voxel_size: tuple[int, int] | None = None) -> None:
+                 read_ground_truth: Callable[[], GroundTruth] | None = None, poses_of: str | None = None,
+                 files: dict[str, Path] | None = None, voxel_size: tuple[int, int] | None = None) -> None:
         self.name = name
         self.path = path
         self.options = options
@@ -88,6 +89,7 @@ class Recording(abc.ABC):
         self.images = images if isinstance(images, ImageFiles) else None
         self._no_images = images if isinstance(images, str) else "the recording has no images"
         self._read_ground_truth = read_ground_truth
+        self.poses_of = poses_of
         self._files = files or {}
 
     @abc.abstractmethod
@@ -160,7 +162,7 @@ class Sequence(Recording):
         windows: the rule that cuts events into windows.
         rectify_map: (H, W, 2) forward map of `utils.undistort`, None for events that need no rectification.
         hot_pixel_stds: threshold of `remove_hot_pixels`, None for no filter.
-        images, read_ground_truth, files, voxel_size: see `Recording`.
+        images, read_ground_truth, poses_of, files, voxel_size: see `Recording`.
 
     Attributes:
         expected_length: how many windows there are for a progress bar (empty ones included), None if unknown.
@@ -170,9 +172,11 @@ class Sequence(Recording):
                  intrinsics: npt.ArrayLike, open_reader: Callable[[], EventReader], windows: WindowRule,
                  rectify_map: npt.NDArray[np.float32] | None = None, hot_pixel_stds: float | None = None,
                  images: ImageFiles | str | None = None, read_ground_truth: Callable[[], GroundTruth] | None = None,
-                 files: dict[str, Path] | None = None, voxel_size: tuple[int, int] | None = None) -> None:
+                 poses_of: str | None = None, files: dict[str, Path] | None = None,
+                 voxel_size: tuple[int, int] | None = None) -> None:
         super().__init__(name, path, options, size=size, intrinsics=intrinsics, images=images,
-                         read_ground_truth=read_ground_truth, files=files, voxel_size=voxel_size)
+                         read_ground_truth=read_ground_truth, poses_of=poses_of, files=files,
+                         voxel_size=voxel_size)
         self._open_reader = open_reader
         self.windows = windows
         self.rectify_map = rectify_map

@@ -96,7 +96,8 @@ def open_tumvie(path: Path, options: SequenceOptions, voxel_size: tuple[int, int
         intrinsics=read_undistorted(path / CALIBRATION_FILE, CAMERAS[side]), open_reader=open_reader, windows=windows,
         rectify_map=read_rectify_map(files["rectify map"], EVENT_SIZE), hot_pixel_stds=HOT_PIXEL_STDS,
         images=find_images(images, stamps, frame_intrinsics, command),
-        read_ground_truth=poses_reader(poses, skip_lines=1), files=files, voxel_size=voxel_size)
+        read_ground_truth=poses_reader(poses, skip_lines=1), poses_of="motion capture body", files=files,
+        voxel_size=voxel_size)
 
 
 def read_camera(path: Path, camera: int) -> Calibration:

@@ -10,9 +10,12 @@ import numpy as np
 
 from devo.errors import DevoError
 from utils.clouds.cloud import PointCloud
+from utils.clouds.open3d_import import import_open3d
 from utils.plots.coloring import NO_COLOR, OWN_COLORS
 from utils.plots.draw import BACKGROUND, LOOK, PATH, PLAIN, START, color_map
 from utils.plots.scene import FRUSTUM_EDGES, Scene
+
+REMEDY = "write a page with --html FILE instead"
 
 
 def has_display() -> bool:
@@ -26,9 +29,9 @@ def geometries(scene: Scene) -> list[Any]:
     """The scene as Open3D geometries: points, camera path, camera pyramids, first camera's axes.
 
     Raises:
-        DevoError: Open3D cannot be imported.
+        InputError: Open3D cannot be imported.
     """
-    open3d = _open3d()
+    open3d = import_open3d(REMEDY)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scene.points))
     cloud.colors = open3d.utility.Vector3dVector(point_colors(scene))
     shapes = [cloud]
@@ -57,10 +60,11 @@ def show(scene: Scene, title: str) -> None:
     """Open a window and return when it is closed.
 
     Raises:
-        DevoError: Open3D cannot be imported, or no window can be opened.
+        InputError: Open3D cannot be imported.
+        DevoError: no window can be opened.
     """
     shapes = geometries(scene)
-    open3d = _open3d()
+    open3d = import_open3d(REMEDY)
     window = open3d.visualization.Visualizer()
     if not window.create_window(window_name=title):
         raise DevoError("no window could be opened (is there a display with OpenGL?); write a page with --html FILE")
@@ -80,14 +84,6 @@ def show_cloud(cloud: PointCloud, title: str) -> None:
     """Open a window with the points alone, in their own colours if they have any; see `show`."""
     color_by = OWN_COLORS if cloud.colors is not None else "depth"
     show(Scene.build(cloud, np.empty((0, 7)), color_by, show_outside=True, most_points=max(len(cloud), 1)), title)
-
-
-def _open3d() -> Any:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise DevoError(f"Open3D cannot be imported ({error}); write a page with --html FILE instead") from error
-    return open3d
 
 
 def _lines(open3d: Any, points: np.ndarray, pairs: np.ndarray, color: str) -> Any:
