@@ -23,6 +23,8 @@ DEFAULTS: dict[str, Any] = {
     "SCORER_EVAL_MODE": "multi",
     # draw the same number of patches in each quadrant of the image
     "SCORER_EVAL_USE_GRID": True,
+    # `multi` only: weight a pixel by its own score; False, as published, by that of its upper left neighbour
+    "SCORER_EVAL_ALIGNED": False,
     # voxel normalisation: none, rescale (norm), standard (std)
     "NORM": "std",
     "PATCHES_PER_FRAME": 80,

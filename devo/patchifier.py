@@ -58,6 +58,7 @@ class Patchifier(nn.Module):
         return_color: bool = False,
         scorer_eval_mode: str = "multi",
         scorer_eval_use_grid: bool = True,
+        scorer_eval_aligned: bool = False,
         coords: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> PatchifierOutput:
@@ -70,6 +71,7 @@ class Patchifier(nn.Module):
             return_color: in evaluation mode, sample colours as the sixth output.
             scorer_eval_mode: `PatchSelector` method in evaluation mode (selectors `scorer` and `gradient`).
             scorer_eval_use_grid: spread evaluation patches evenly over the four quadrants.
+            scorer_eval_aligned: see `PatchSelector`.
             coords: `(B*n, M, 2)` integer-valued quarter-resolution pixels (x, y) in [1, w-2] x [1, h-2], which
                 replace the selection.
             generator: source of randomness, the global one if omitted.
@@ -95,8 +97,8 @@ class Patchifier(nn.Module):
             expected = (*clips, height, width)
             raise InputError(f"inverse depths disps have shape {tuple(disps.shape)}; expected {expected}")
         if coords is None:
-            method, grid = scorer_eval_mode, scorer_eval_use_grid
-            x, y, scores = self._select(images, (height, width), patches_per_image, method, grid, generator)
+            selector = PatchSelector(scorer_eval_mode, scorer_eval_use_grid, scorer_eval_aligned)
+            x, y, scores = self._select(images, (height, width), patches_per_image, selector, generator)
             coords = torch.stack((x, y), dim=-1).float()
         else:
             coords = self._checked(coords, (frames, height, width))
@@ -141,8 +143,7 @@ class Patchifier(nn.Module):
         images: Tensor,
         size: tuple[int, int],
         count: int,
-        method: str,
-        grid: bool,
+        selector: PatchSelector,
         generator: torch.Generator | None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Positions (x, y), each (N, count) int64, and the scores (N, count) of training with the scorer."""
@@ -156,12 +157,12 @@ class Patchifier(nn.Module):
             y = torch.randint(1, height - 1, (frames, count), generator=generator, device=images.device)
             return x, y, None
         if self.patch_selector == "gradient":
-            selector = PatchSelector("3xrandom") if self.training else PatchSelector(method, grid)
+            selector = PatchSelector("3xrandom") if self.training else selector
             x, y = selector(event_gradient(images), count, generator)
             return x.clamp(1, width - 2), y.clamp(1, height - 2), None
         scores = torch.sigmoid(self.scorer.rate(images).float())
         if not self.training:
-            x, y = PatchSelector(method, grid)(scores, count, generator)
+            x, y = selector(scores, count, generator)
             return x + 1, y + 1, None
         rows, columns = scores.shape[-2:]
         candidates = (frames, CANDIDATE_FACTOR * count)

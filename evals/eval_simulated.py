@@ -7,6 +7,9 @@ patches`, `scored patches` and `gradient patches` (the same network, patches dra
 gradient of the event image) and `untrained` (the same architecture, random weights). A run counts as lost if the
 tracker says so or its error exceeds a fifth of the path.
 
+Depth errors are medians over the points that the quality filter keeps with its defaults (`depth %`), and over the
+cloud that `export_pointcloud.py --cleanup` writes (`cleaned %`), both after the scale of the trajectory.
+
 Example: python evals/eval_simulated.py --split test --trials 3
 """
 
@@ -39,7 +42,11 @@ DEFAULT_VARIANTS = ("trained", "random patches", "untrained")
 
 @dataclass(frozen=True)
 class Score:
-    """Outcome of one run: `ate` as a share of the path length, `depth` the median relative depth error after scale."""
+    """Outcome of one run: `ate` as a share of the path length, `depth` the median relative depth error after scale.
+
+    `cleaned_depth` and `cleaned_points` belong to the cleaned cloud, `depth` to the points of good quality, `points`
+    to all.
+    """
 
     sequence: str
     variant: str
@@ -47,7 +54,9 @@ class Score:
     status: str
     ate: float
     depth: float
+    cleaned_depth: float
     points: int
+    cleaned_points: int
     keyframes: int
     tracked_share: float
     fps: float
@@ -56,7 +65,8 @@ class Score:
     def row(self) -> str:
         """One line of the table."""
         return (f"| {self.sequence} | {self.variant} | {self.trial} | {self.status} | {100 * self.ate:.2f} | "
-                f"{100 * self.depth:.2f} | {self.points} | {self.keyframes} | {self.fps:.2f} |")
+                f"{100 * self.depth:.2f} | {100 * self.cleaned_depth:.2f} | {self.points} | {self.cleaned_points} | "
+                f"{self.keyframes} | {self.fps:.2f} |")
 
     @property
     def lost(self) -> bool:
@@ -100,15 +110,15 @@ def evaluate(name: str, settings: dict[str, Any], seconds: float, cache: Path, n
     start = time.perf_counter()
     result = track(recording.voxels(), cfg, network, seed=trial)
     fps = len(result.poses) / (time.perf_counter() - start)
-    ate = depth = float("nan")
+    ate, depth, cleaned = float("nan"), (float("nan"), float("nan")), 0
     if result.ok and result.observables is not None:
         truth = recording.ground_truth()
         assert truth is not None, f"{folder} was simulated, so it has a ground truth"
         ate, scale = trajectory_share(result.tstamps, result.poses, *truth)
-        depth = depth_error(result.observables, scale, SimulatedSequence(simulated))
+        depth, cleaned = depth_errors(result.observables, scale, SimulatedSequence(simulated))
     count = 0 if result.observables is None or not np.isfinite(ate) else len(result.observables)
-    return Score(name, variant, trial, result.status.value, ate, depth, count, result.counters.get("keyframes", 0),
-                 result.tracked_share, fps)
+    return Score(name, variant, trial, result.status.value, ate, *depth, count, cleaned,
+                 result.counters.get("keyframes", 0), result.tracked_share, fps)
 
 
 def trajectory_share(tstamps: Any, poses: Any, stamps: Any, truth: Any) -> tuple[float, float]:
@@ -122,22 +132,41 @@ def trajectory_share(tstamps: Any, poses: Any, stamps: Any, truth: Any) -> tuple
     return share, float(alignment.scale)
 
 
-def depth_error(observables: Any, scale: float, simulated: Any) -> float:
-    """Median of |scale * depth - true depth| / true depth over the points that the quality filter keeps."""
+def depth_errors(observables: Any, scale: float, simulated: Any) -> tuple[tuple[float, float], int]:
+    """Medians of |scale * depth - true depth| / true depth.
+
+    Args:
+        observables: of the run.
+        scale: true over estimated length.
+        simulated: the sequence, which knows its depth at every time.
+
+    Returns:
+        The medians over the points of good quality and over the cleaned cloud (NaN where there are none), and the
+        size of the cleaned cloud.
+    """
+    from dataclasses import replace
+
     import numpy as np
     import torch
 
-    from utils.clouds.filters import quality_filter
+    from utils.clouds.filters import clean_cloud
+    from utils.export_options import ExportOptions
     from utils.export_products import observables_to_cloud
 
-    keep, _ = quality_filter(observables_to_cloud(observables))
-    stamps, host = np.unique(observables.t_us[keep], return_inverse=True)
-    if len(stamps) == 0:
-        return float("nan")
-    column, row = np.rint(observables.pixel_xy[keep]).astype(int).T
+    cloud = observables_to_cloud(observables)
+    if len(cloud) == 0:
+        return (float("nan"), float("nan")), 0
+    stamps, host = np.unique(observables.t_us, return_inverse=True)
+    column, row = np.rint(observables.pixel_xy).astype(int).T
     truth = torch.cat([simulated.depth(stamps[i:i + 8]) for i in range(0, len(stamps), 8)])[host, row, column].numpy()
-    seen = truth > 0
-    return float(np.median(np.abs(scale * observables.depths[keep][seen] - truth[seen]) / truth[seen]))
+    error = np.abs(scale * observables.depths - truth) / np.where(truth > 0, truth, np.nan)
+    cloud = replace(cloud, scalars={**cloud.scalars, "relative_error": error})
+    medians, size = [], 0
+    for steps in (["quality"], ExportOptions(datapath="").cleanup_steps()):
+        kept = clean_cloud(cloud, steps)[0].scalars["relative_error"]
+        medians.append(float(np.nanmedian(kept)) if np.isfinite(kept).any() else float("nan"))
+        size = len(kept)
+    return (medians[0], medians[1]), size
 
 
 def summarise(scores: Sequence[Score], variant: str) -> dict[str, Any]:
@@ -155,6 +184,7 @@ def summarise(scores: Sequence[Score], variant: str) -> dict[str, Any]:
             "ate_percent": 100 * median([score.ate if not score.lost else np.inf for score in mine]),
             "ate_percent_tracked": 100 * median([score.ate for score in good]),
             "depth_percent": 100 * median([score.depth for score in good]),
+            "cleaned_percent": 100 * median([score.cleaned_depth for score in good]),
             "points": median([score.points for score in good]), "fps": median([score.fps for score in mine])}
 
 
@@ -303,7 +333,8 @@ def main(argv: Sequence[str] | None = None) -> int:
              for trial in range(args.trials) for name, settings in chosen[::args.every] for variant in args.variants]
     report = Report(args.json, {"split": args.split, "seconds": args.seconds, "config": cfg.as_dict(),
                                 "weights": _fingerprint(weights, cfg.PATCH_SELECTOR)})
-    print("| sequence | variant | trial | status | ATE % | depth % | points | keyframes | fps |\n|" + "---|" * 9)
+    print("| sequence | variant | trial | status | ATE % | depth % | cleaned % | points | cleaned | "
+          "keyframes | fps |\n|" + "---|" * 11)
     for score in report.scores:
         print(score.row, flush=True)
     done = {(score.sequence, score.variant, score.trial) for score in report.scores}

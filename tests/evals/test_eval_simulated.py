@@ -10,9 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from devo.errors import InputError
-from evals.eval_simulated import SCENES, SIZES, Report, Score, sequences, summarise, trajectory_share
+from devo.observables import Observables
+from evals.eval_simulated import (
+    SCENES,
+    SIZES,
+    Report,
+    Score,
+    depth_errors,
+    sequences,
+    summarise,
+    trajectory_share,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,7 +40,7 @@ def test_splits_hold_twenty_different_sequences_of_all_scenes_and_sizes() -> Non
 
 
 def score(ate: float, status: str = "tracked", sequence: str = "a") -> Score:
-    return Score(sequence, "trained", 0, status, ate, 0.05, 100, 10, 1.0, 2.0)
+    return Score(sequence, "trained", 0, status, ate, 0.05, 0.03, 100, 40, 10, 1.0, 2.0)
 
 
 def test_lost_runs_count_against_the_median() -> None:
@@ -56,6 +67,41 @@ def test_trajectory_share_is_free_of_frame_and_scale() -> None:
     way = np.stack([np.interp(seen, stamps, truth[:, axis]) for axis in range(3)], axis=1)
     path = np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
     assert trajectory_share(seen, poses, stamps, truth)[0] == pytest.approx(0.01 / path, rel=0.01)
+
+
+class Wall:
+    """A sequence that sees a wall at 2 m in its upper half and nothing below."""
+
+    def depth(self, t_us: np.ndarray) -> torch.Tensor:
+        depth = torch.zeros(len(t_us), 60, 80)
+        depth[:, :30] = 2.0
+        return depth
+
+
+def observables(depths: np.ndarray, sigma: np.ndarray, rows: np.ndarray) -> Observables:
+    count = len(depths)
+    pixel_xy = np.stack([np.linspace(0, 79, count), rows], axis=1).astype(np.float32)
+    points = np.stack([pixel_xy[:, 0] / 80 * depths, pixel_xy[:, 1] / 80 * depths, depths], axis=1)
+    host = np.arange(count) // 10
+    values = {"points": points, "pixel_xy": pixel_xy, "depths": depths, "inv_depths": 1 / depths, "host_frame": host,
+              "t_us": host * 1000, "observations": np.full(count, 9), "parallax_deg": np.full(count, 8.0),
+              "mean_weight": np.full(count, 0.5), "residual_px": np.full(count, 0.1), "inv_depth_sigma": sigma,
+              "clamped": np.zeros(count, bool)}
+    return Observables(**{"colors": None, **values})
+
+
+def test_depth_errors_of_all_good_points_and_of_the_cleaned_cloud() -> None:
+    count = 400
+    order = np.arange(count)
+    certain = order % 2 == 0
+    depths = np.where(certain, 0.202, 0.22)  # true is 0.2 at this scale: 1 and 10 % off
+    sigma = np.where(certain, 0.01, 0.5) / depths
+    rows = np.where(order % 4 < 2, order % 30, 45)  # half of the points look past the wall
+    (good, cleaned), size = depth_errors(observables(depths, sigma, rows), 10.0, Wall())
+    assert good == pytest.approx(0.055) and cleaned == pytest.approx(0.01)
+    assert 0.4 * count < size <= 0.5 * count
+    (good, cleaned), size = depth_errors(observables(depths, sigma, np.full(count, 45)), 10.0, Wall())
+    assert math.isnan(good) and math.isnan(cleaned) and size > 0
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess:
