@@ -23,8 +23,9 @@ DEFAULTS: dict[str, Any] = {
     "SCORER_EVAL_MODE": "multi",
     # draw the same number of patches in each quadrant of the image
     "SCORER_EVAL_USE_GRID": True,
-    # `multi` only: weight a pixel by its own score; False, as published, by that of its upper left neighbour
-    "SCORER_EVAL_ALIGNED": False,
+    # `multi` only, the pixel of a 4x4 cell: shifted (drawn by the score of its upper left neighbour, as published),
+    # drawn (by its own score), best (the highest score, which puts patches onto edges)
+    "SCORER_EVAL_PIXEL": "shifted",
     # voxel normalisation: none, rescale (norm), standard (std)
     "NORM": "std",
     "PATCHES_PER_FRAME": 80,
@@ -56,6 +57,9 @@ DEFAULTS: dict[str, Any] = {
     # solve for the first structure twice, the second time from its reversed relief, and keep what explains more; False
     # as published
     "MIRROR_TEST": True,
+    # the same for flatter and deeper reliefs, up to that often from the best found so far; each round costs four times
+    # INITIAL_UPDATES updates of 8 keyframes
+    "START_ROUNDS": 0,
     # poses of frames that were passed over before initialisation because the camera had hardly moved: interpolate (in
     # time, between the keyframes around them) or hold (that of the keyframe before, as published)
     "STILL_FRAMES": "interpolate",
@@ -68,9 +72,9 @@ DEFAULTS: dict[str, Any] = {
 _AT_LEAST = {
     "BUFFER_SIZE": 9, "PATCHES_PER_FRAME": 1, "REMOVAL_WINDOW": 1, "OPTIMIZATION_WINDOW": 1, "PATCH_LIFETIME": 1,
     "KEYFRAME_INDEX": 2, "KEYFRAME_THRESH": 0.0, "MOTION_DAMPING": 0.0, "RING_SIZE": 0,
-    "INITIAL_INV_DEPTH": 0.0, "INITIAL_UPDATES": 1, "PROBE_FLOW": 0.0,
+    "INITIAL_INV_DEPTH": 0.0, "INITIAL_UPDATES": 1, "START_ROUNDS": 0, "PROBE_FLOW": 0.0,
 }
-_CHOICES = {"STILL_FRAMES": ("interpolate", "hold")}
+_CHOICES = {"SCORER_EVAL_PIXEL": ("shifted", "drawn", "best"), "STILL_FRAMES": ("interpolate", "hold")}
 
 
 def _coerce(key: str, value: Any) -> Any:

@@ -171,7 +171,7 @@ class DEVO(PatchGraph):
             fmap, gmap, imap, patches, _, colors = self.network.patchify(
                 prepared[None, None], patches_per_image=self.M, return_color=True,
                 scorer_eval_mode=self.cfg.SCORER_EVAL_MODE, scorer_eval_use_grid=self.cfg.SCORER_EVAL_USE_GRID,
-                scorer_eval_aligned=self.cfg.SCORER_EVAL_ALIGNED)
+                scorer_eval_pixel=self.cfg.SCORER_EVAL_PIXEL)
         self._write_frame(tstamp, intrinsics, patches, colors)
         self.ring.store(self.n, fmap, gmap, imap)
         self.counter += 1

@@ -1,10 +1,11 @@
-"""Start-up of the tracker: the first structure, and whether its relief is the right way round.
+"""Start-up of the tracker: the first structure, and the search for a better one.
 
-A scene seen from nearby places has two explanations of nearly the same image motion: the true one, and one with the
-relief turned inside out, the opposite motion and a rotation that makes up for it (the reversal ambiguity of
-structure from motion; exact under orthographic projection, see Szeliski and Kang, "Shape ambiguities in structure
-from motion", PAMI 1997). From equal depths and poses, either can be found. Once found, no update leads from one to the
-other, but the wrong one leaves larger residuals.
+A scene seen from nearby places has a family of explanations of nearly the same image motion: relief can be traded for
+sideways motion and rotation (the bas-relief ambiguity of structure from motion), and with a negative factor the relief
+is inside out (the reversal ambiguity; both exact under orthographic projection, see Szeliski and Kang, "Shape
+ambiguities in structure from motion", PAMI 1997). From equal depths and poses, any of them can be found. Once found,
+updates hardly lead from one to another, since measurements lean towards the structure they start from; but the wrong
+ones leave larger residuals.
 """
 
 from __future__ import annotations
@@ -24,29 +25,49 @@ if TYPE_CHECKING:
 UNEXPLAINED = 1.0
 """Squared residual [quarter-resolution px^2] at which a measurement counts as not explained at all."""
 NEAREST, FARTHEST = 3.0, 0.3
-"""Limits of the inverse depths of a reversed relief, relative to the middle one."""
+"""Limits of the inverse depths of a reshaped relief, relative to the middle one."""
+REVERSED = -1.0
+RESHAPED = (0.4, 2.5, 6.0)
+"""Factors of the relief to start from again; updates level it more easily than they raise it."""
+CLEAR_GAIN = 0.9
+"""In a search over several starts, residuals have to fall below this share to replace a solution."""
 
 
 def initialize(tracker: DEVO) -> None:
-    """Solve for the first keyframes of a tracker that has just collected them.
+    """Solve for the first keyframes of a tracker that has just collected them, and keep the best of several starts.
 
-    `INITIAL_UPDATES` updates; with `MIRROR_TEST`, as many again from the reversed relief, and the solution with the
-    smaller residuals stays. `counters["reversed_start"]` says 1 where that was the second one.
+    `INITIAL_UPDATES` updates; then as many again from other explanations of the same image motion. With `MIRROR_TEST`
+    that is the reversed relief, and the solution with the smaller residuals stays. `START_ROUNDS` > 0 also tries
+    flatter and deeper reliefs, that often from the best found so far, as long as a round lowers the residuals clearly.
+
+    `counters["reversed_start"]` says 1 where the solution that stayed came from a reversed relief (or thrice, ...),
+    `counters["better_starts"]` how often a solution was replaced.
     """
     tracker.is_initialized = True
+    mirror, rounds = getattr(tracker.cfg, "MIRROR_TEST", False), getattr(tracker.cfg, "START_ROUNDS", 0)
+    factors = (REVERSED,) * mirror + RESHAPED * (rounds > 0)
+    gain = CLEAR_GAIN if rounds > 0 else 1.0
     _solve(tracker)
-    if not getattr(tracker.cfg, "MIRROR_TEST", False):
-        return
-    first = _Solution.of(tracker)
+    best, replaced, is_reversed = _Solution.of(tracker), 0, 0
+    for _ in range(max(rounds, 1) if factors else 0):
+        others = {factor: _solve_from(tracker, best, factor) for factor in factors}
+        factor = min(others, key=lambda key: others[key].cost)
+        if not others[factor].cost < gain * best.cost:
+            break
+        best, replaced, is_reversed = others[factor], replaced + 1, is_reversed ^ (factor < 0)
+    best.restore(tracker)
+    tracker.counters["reversed_start"], tracker.counters["better_starts"] = is_reversed, replaced
+
+
+def _solve_from(tracker: DEVO, start: _Solution, factor: float) -> _Solution:
+    """The solution found from the reshaped relief of another one, with measurements that do not remember that one."""
+    start.restore(tracker)
     count = tracker.n
-    poses, inv_depths = reversed_relief(tracker.poses_[:count], tracker.patches_[:count, :, 2])
+    poses, inv_depths = reshaped_relief(tracker.poses_[:count], tracker.patches_[:count, :, 2], factor)
     tracker.poses_[:count], tracker.patches_[:count, :, 2] = poses, inv_depths
     tracker.net = torch.zeros_like(tracker.net)
     _solve(tracker)
-    is_better = _Solution.of(tracker).cost < first.cost
-    if not is_better:
-        first.restore(tracker)
-    tracker.counters["reversed_start"] = int(is_better)
+    return _Solution.of(tracker)
 
 
 def _solve(tracker: DEVO) -> None:
@@ -54,27 +75,29 @@ def _solve(tracker: DEVO) -> None:
         tracker.update()
 
 
-def reversed_relief(cam_T_world: Tensor, inv_depths: Tensor) -> tuple[Tensor, Tensor]:
-    """The other explanation of the same image motion, to first order in motion and relief.
+def reshaped_relief(cam_T_world: Tensor, inv_depths: Tensor, factor: float) -> tuple[Tensor, Tensor]:
+    """Another explanation of the same image motion, to first order in motion and relief.
 
     With inverse depths d = m + e around their median m, image motion is A w + m B t + e B t (A: rotation, B:
-    translation). Turning e and the sideways part of t around keeps the last term, and a rotation by 2 m (-t_y, t_x, 0),
-    which for small angles moves the image as a sideways shift does, keeps the sum of the others. Motion along the
-    optical axis has no such partner and stays.
+    translation). Multiplying e and dividing the sideways part of t by `factor` keeps the last term, and a rotation by
+    (1 - 1 / factor) m (-t_y, t_x, 0), which for small angles moves the image as a sideways shift does, keeps the sum of
+    the others. Motion along the optical axis has no such partner and stays.
 
     Args:
         cam_T_world: `(N,7)`, the first one near the identity.
         inv_depths: `(N,M,...)`, positive.
+        factor: of the relief, not 0; -1 turns it inside out.
 
     Returns:
         Poses `(N,7)` and inverse depths of the same shape, these limited to `FARTHEST`..`NEAREST` times the median.
     """
     middle = torch.quantile(inv_depths.flatten(), 0.5)
     x, y, z = cam_T_world[:, :3].unbind(dim=1)
-    turn = SO3.exp(2.0 * middle * torch.stack([-y, x, torch.zeros_like(z)], dim=1))
+    turn = SO3.exp((1.0 - 1.0 / factor) * middle * torch.stack([-y, x, torch.zeros_like(z)], dim=1))
     rotation = turn * SO3(cam_T_world[:, 3:])
-    poses = torch.cat([torch.stack([-x, -y, z], dim=1), rotation.data], dim=1)
-    return SE3(poses).data, (2.0 * middle - inv_depths).clamp(FARTHEST * middle, NEAREST * middle)
+    poses = torch.cat([torch.stack([x / factor, y / factor, z], dim=1), rotation.data], dim=1)
+    reshaped = middle + factor * (inv_depths - middle)
+    return SE3(poses).data, reshaped.clamp(FARTHEST * middle, NEAREST * middle)
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ class Patchifier(nn.Module):
         return_color: bool = False,
         scorer_eval_mode: str = "multi",
         scorer_eval_use_grid: bool = True,
-        scorer_eval_aligned: bool = False,
+        scorer_eval_pixel: str = "shifted",
         coords: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> PatchifierOutput:
@@ -71,7 +71,7 @@ class Patchifier(nn.Module):
             return_color: in evaluation mode, sample colours as the sixth output.
             scorer_eval_mode: `PatchSelector` method in evaluation mode (selectors `scorer` and `gradient`).
             scorer_eval_use_grid: spread evaluation patches evenly over the four quadrants.
-            scorer_eval_aligned: see `PatchSelector`.
+            scorer_eval_pixel: how the pixel of a cell is chosen, see `PatchSelector`.
             coords: `(B*n, M, 2)` integer-valued quarter-resolution pixels (x, y) in [1, w-2] x [1, h-2], which
                 replace the selection.
             generator: source of randomness, the global one if omitted.
@@ -97,7 +97,7 @@ class Patchifier(nn.Module):
             expected = (*clips, height, width)
             raise InputError(f"inverse depths disps have shape {tuple(disps.shape)}; expected {expected}")
         if coords is None:
-            selector = PatchSelector(scorer_eval_mode, scorer_eval_use_grid, scorer_eval_aligned)
+            selector = PatchSelector(scorer_eval_mode, scorer_eval_use_grid, scorer_eval_pixel)
             x, y, scores = self._select(images, (height, width), patches_per_image, selector, generator)
             coords = torch.stack((x, y), dim=-1).float()
         else:

@@ -15,6 +15,7 @@ NMS_RADIUS = 1.5
 NMS_IOU = 0.4
 EPSILON = 1e-7
 METHODS = ("multi", "topk", "nms", "3xrandom", "random")
+PIXELS = ("shifted", "drawn", "best")
 
 
 class Scorer(nn.Module):
@@ -66,7 +67,7 @@ def event_gradient(images: Tensor) -> Tensor:
 class PatchSelector:
     """Draws patch positions from score maps; on maps with fewer cells than patches the cells take turns again.
 
-    Methods: `multi` (multinomial over the 4x4 cells, then over the 16 pixels of a cell; at most one patch per cell),
+    Methods: `multi` (multinomial over the 4x4 cells, then one of the 16 pixels of a cell; at most one patch per cell),
     `topk` (best cells by their maximum), `nms` (the same after non-maximum suppression of touching maxima),
     `3xrandom` (best third of uniform candidates, ascending), `random` (uniform).
 
@@ -77,17 +78,20 @@ class PatchSelector:
     Args:
         method: one of `METHODS`.
         grid: pick from the four quadrants evenly.
-        aligned: `multi` only. The published rule weights pixel (x, y) of a cell by the score of (x-1, y-1); trained
-            networks expect that, hence False by default. True uses the score of the pixel itself.
+        pixel: `multi` only, how the pixel of a cell is chosen. `shifted`, as published: drawn with the score of its
+            upper left neighbour as the weight; `drawn`: with its own score; `best`: the one with the highest score,
+            which puts patches onto edges and clouds onto what is drawn in the scene.
     """
 
-    def __init__(self, method: str = "multi", grid: bool = False, aligned: bool = False) -> None:
+    def __init__(self, method: str = "multi", grid: bool = False, pixel: str = "shifted") -> None:
         method = method.lower()
         if method not in METHODS:
             raise InputError(f"unknown patch selection method {method!r}; expected one of {', '.join(METHODS)}")
+        if pixel not in PIXELS:
+            raise InputError(f"unknown choice of pixels {pixel!r}; expected one of {', '.join(PIXELS)}")
         self.method = method
         self.grid = grid
-        self.aligned = aligned
+        self.pixel = pixel
 
     def __call__(self, scores: Tensor, ppi: int, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """Pick `ppi` positions per map.
@@ -152,13 +156,16 @@ class PatchSelector:
         cell = _interleave(chosen, ppi)
         columns = coarse.shape[-1]
         cell_y, cell_x = cell // columns, cell % columns
-        shift = 0 if self.aligned else 1
+        shift = 1 if self.pixel == "shifted" else 0
         framed = functional.pad(padded, (shift, 0, shift, 0))
         offset = torch.arange(KERNEL_SIZE * KERNEL_SIZE, device=padded.device)
         rows = KERNEL_SIZE * cell_y[..., None] + offset // KERNEL_SIZE
         cols = KERNEL_SIZE * cell_x[..., None] + offset % KERNEL_SIZE
         fine = framed.flatten(1).gather(1, (rows * framed.shape[-1] + cols).flatten(1)).view(rows.shape) + EPSILON
         pick = _draw(fine, 1, generator)[..., 0]
+        if self.pixel == "best":  # where cells take turns again, the later turns are drawn
+            first_turn = torch.arange(ppi, device=padded.device) // weight.shape[1] < weight.shape[2]
+            pick = torch.where(first_turn, fine.argmax(dim=-1), pick)
         return KERNEL_SIZE * cell_x + pick % KERNEL_SIZE, KERNEL_SIZE * cell_y + pick // KERNEL_SIZE
 
     def _maxima(self, padded: Tensor, ppi: int) -> tuple[Tensor, Tensor]:

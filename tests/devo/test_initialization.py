@@ -1,4 +1,4 @@
-"""The first structure: the reversed relief, and the choice between the two."""
+"""The first structure: reliefs reshaped, and the choice between the solutions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 from devo import initialization
 from devo import projective_ops as pops
-from devo.initialization import reversed_relief, unexplained_share
+from devo.initialization import reshaped_relief, unexplained_share
 from devo.lietorch import SE3
 from tests.devo.test_tracker import make_tracker, trajectory_scale
 from tests.oracle import OracleScene, OracleTracker
@@ -39,26 +39,30 @@ def image_motion(poses: torch.Tensor, inv_depths: torch.Tensor, pixels: torch.Te
     return seen.view(3, 20, 2) - pixels[:1]
 
 
+@pytest.mark.parametrize("factor", [-1.0, 0.5, 1.25])
 @pytest.mark.parametrize("size", [1e-3, 1e-2])
-def test_reversed_relief_causes_nearly_the_same_image_motion(size: float) -> None:
+def test_a_reshaped_relief_causes_nearly_the_same_image_motion(size: float, factor: float) -> None:
     poses, inv_depths, pixels = small_motion(size)
-    other_poses, other_depths = reversed_relief(poses, inv_depths)
+    other_poses, other_depths = reshaped_relief(poses, inv_depths, factor)
     motion, other = image_motion(poses, inv_depths, pixels), image_motion(other_poses, other_depths, pixels)
     assert (motion - other).abs().max() < 0.12 * motion.abs().max(), "first order in motion, small field of view"
-    torch.testing.assert_close(other_depths - 0.5, 0.5 - inv_depths)
+    torch.testing.assert_close(other_depths - 0.5, factor * (inv_depths - 0.5))
     unchanged = image_motion(poses, other_depths, pixels)
     assert (motion - unchanged).abs().max() > 2.0 * (motion - other).abs().max(), "the poses have to change as well"
 
 
-def test_reversing_twice_gives_the_first_structure_back() -> None:
+@pytest.mark.parametrize("factor", [-1.0, 0.5, 1.25])
+def test_reshaping_back_gives_the_first_structure_again(factor: float) -> None:
     poses, inv_depths, _ = small_motion(1e-3)
-    again, depths = reversed_relief(*reversed_relief(poses, inv_depths))
+    again, depths = reshaped_relief(*reshaped_relief(poses, inv_depths, factor), 1.0 / factor)
     torch.testing.assert_close(depths, inv_depths)
     torch.testing.assert_close(again, poses, atol=1e-5, rtol=0)
 
 
-def test_reversed_depths_stay_positive() -> None:
-    _, depths = reversed_relief(SE3.exp(torch.zeros(2, 6)).data, torch.tensor([[0.1, 0.5], [0.5, 9.0]]))
+@pytest.mark.parametrize("factor", [-1.0, 6.0])
+def test_reshaped_depths_stay_positive(factor: float) -> None:
+    inv_depths = torch.tensor([[0.1, 0.5], [0.5, 9.0]])
+    _, depths = reshaped_relief(SE3.exp(torch.zeros(2, 6)).data, inv_depths, factor)
     assert depths.min() >= 0.3 * 0.5 and depths.max() <= 3.0 * 0.5
 
 
@@ -72,28 +76,33 @@ def run_until_initialised(**changes: object) -> tuple[OracleTracker, OracleScene
     raise AssertionError("24 frames with motion are enough")
 
 
-def test_a_first_structure_that_is_right_stays_as_it_is() -> None:
+@pytest.mark.parametrize(("rounds", "mirror", "starts"), [(0, True, 2), (2, True, 5), (2, False, 4)])
+def test_a_first_structure_that_is_right_stays_as_it_is(rounds: int, mirror: bool, starts: int) -> None:
     once, _ = run_until_initialised(MIRROR_TEST=False)
-    twice, _ = run_until_initialised(MIRROR_TEST=True)
-    assert twice.counters["reversed_start"] == 0
+    several, _ = run_until_initialised(MIRROR_TEST=mirror, START_ROUNDS=rounds)
+    assert several.counters["reversed_start"] == several.counters["better_starts"] == 0
     for name in ("poses_", "patches_", "net", "target_", "weight_"):
-        assert torch.equal(getattr(once, name), getattr(twice, name)), name
-    assert twice.counters["updates"] == 2 * once.counters["updates"]
+        assert torch.equal(getattr(once, name), getattr(several, name)), name
+    assert several.counters["updates"] == starts * once.counters["updates"]
 
 
-def test_a_first_structure_that_is_wrong_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("factor", "rounds", "mirror"), [(-1.0, 0, True), (-1.0, 2, True), (0.4, 1, False),
+                                                          (2.5, 1, False)])
+def test_a_first_structure_that_is_wrong_is_replaced(monkeypatch: pytest.MonkeyPatch, factor: float, rounds: int,
+                                                     mirror: bool) -> None:
     solve, calls = initialization._solve, []
 
     def solve_wrongly_at_first(tracker: OracleTracker) -> None:
         solve(tracker)
         calls.append(tracker.n)
-        if len(calls) == 1:  # a solver that ended on the wrong side
-            state = reversed_relief(tracker.poses_[:tracker.n], tracker.patches_[:tracker.n, :, 2])
+        if len(calls) == 1:  # a solver that ended in the wrong place
+            state = reshaped_relief(tracker.poses_[:tracker.n], tracker.patches_[:tracker.n, :, 2], factor)
             tracker.poses_[:tracker.n], tracker.patches_[:tracker.n, :, 2] = state
 
     monkeypatch.setattr(initialization, "_solve", solve_wrongly_at_first)
-    tracker, scene = run_until_initialised()
-    assert len(calls) == 2 and tracker.counters["reversed_start"] == 1
+    tracker, scene = run_until_initialised(START_ROUNDS=rounds, MIRROR_TEST=mirror)
+    assert tracker.counters["better_starts"] >= 1
+    assert factor > 0 or rounds > 0 or (len(calls) == 2 and tracker.counters["reversed_start"] == 1)
     scale = trajectory_scale(tracker, scene)
     keyframes = tracker.tstamps_[:tracker.n]
     error = scale * tracker.result().poses[keyframes, :3] - scene.world_T_cam.data[keyframes, :3].numpy()

@@ -127,16 +127,16 @@ def test_patchifier_equals_reference(network: eVONet, reference: dict[str, Tenso
     assert index.tolist() == [0] * 10 + [1] * 10 and index.dtype == torch.int64
 
 
-@pytest.mark.parametrize("aligned", [True, False])
-def test_aligned_patches_lie_where_the_scores_are(monkeypatch: pytest.MonkeyPatch, aligned: bool) -> None:
+@pytest.mark.parametrize(("pixel", "offset"), [("best", 1), ("drawn", 1), ("shifted", 2)])
+def test_patches_lie_where_the_scores_are(monkeypatch: pytest.MonkeyPatch, pixel: str, offset: int) -> None:
+    """Score cell s is feature pixel s + 1; the published rule lands one further."""
     network = small_network().eval()
     scores = torch.full((2, 11, 15), -20.0)
     scores[:, 5, 6] = 20.0  # not in the last row or column of its 4x4 cell
     monkeypatch.setattr(network.patchify.scorer, "rate", lambda frames: scores)
     with torch.no_grad():
-        patches = network.patchify(voxels()[:1], 4, scorer_eval_use_grid=False, scorer_eval_aligned=aligned)[3]
+        patches = network.patchify(voxels()[:1], 4, scorer_eval_use_grid=False, scorer_eval_pixel=pixel)[3]
     first = patches[0].unflatten(0, (2, 4))[:, 0, :2, 1, 1]
-    offset = 1 if aligned else 2  # score cell s is feature pixel s + 1; the published rule lands one further
     assert first.tolist() == [[6.0 + offset, 5.0 + offset]] * 2
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devo.errors import InputError
-from devo.selector import METHODS, PatchSelector, Scorer, event_gradient, suppress_neighbours
+from devo.selector import METHODS, PIXELS, PatchSelector, Scorer, event_gradient, suppress_neighbours
 
 CELL_METHODS = ("multi", "topk", "nms")
 
@@ -30,14 +30,14 @@ def test_topk_equals_reference(fixture_npz, grid: bool) -> None:
 @given(
     method=st.sampled_from(METHODS),
     grid=st.booleans(),
-    aligned=st.booleans(),
+    pixel=st.sampled_from(PIXELS),
     height=st.integers(16, 45),
     width=st.integers(16, 45),
     ppi=st.integers(1, 40),
     kind=st.sampled_from(["noise", "zero", "constant", "one peak", "tiny"]),
     seed=st.integers(0, 1000),
 )
-def test_positions_lie_on_the_map(method, grid, aligned, height, width, ppi, kind, seed) -> None:
+def test_positions_lie_on_the_map(method, grid, pixel, height, width, ppi, kind, seed) -> None:
     scores = torch.rand(2, 1, height, width, generator=generator(seed))
     if kind == "zero":
         scores.zero_()
@@ -48,13 +48,13 @@ def test_positions_lie_on_the_map(method, grid, aligned, height, width, ppi, kin
     elif kind == "tiny":
         scores *= 1e-30
     before = scores.clone()
-    x, y = PatchSelector(method, grid, aligned)(scores, ppi, generator(seed))
+    x, y = PatchSelector(method, grid, pixel)(scores, ppi, generator(seed))
     assert x.shape == y.shape == (2, ppi)
     assert x.dtype == y.dtype == torch.int64
     assert int(x.min()) >= 0 and int(x.max()) < width
     assert int(y.min()) >= 0 and int(y.max()) < height
     assert torch.equal(scores, before)
-    again = PatchSelector(method, grid, aligned)(scores, ppi, generator(seed))
+    again = PatchSelector(method, grid, pixel)(scores, ppi, generator(seed))
     assert torch.equal(x, again[0]) and torch.equal(y, again[1])
 
 
@@ -86,8 +86,9 @@ def test_lone_peak_is_returned_one_pixel_off(peak, returned) -> None:
         ppi = 4 if grid else 1
         x, y = PatchSelector("multi", grid)(scores, ppi, generator())
         assert returned in set(zip(x[0].tolist(), y[0].tolist()))
-        x, y = PatchSelector("multi", grid, aligned=True)(scores, ppi, generator())
-        assert peak in set(zip(x[0].tolist(), y[0].tolist()))
+        for pixel in ("drawn", "best"):
+            x, y = PatchSelector("multi", grid, pixel)(scores, ppi, generator())
+            assert peak in set(zip(x[0].tolist(), y[0].tolist()))
 
 
 def test_peak_in_last_row_and_column_gives_random_offset() -> None:
@@ -99,14 +100,26 @@ def test_peak_in_last_row_and_column_gives_random_offset() -> None:
     assert int(counts.min()) >= 8 and int(counts.max()) <= 50  # 25 expected, standard deviation 4.8
 
 
+def test_best_pixels_are_the_maxima_of_their_cells_and_no_place_is_taken_twice_at_first() -> None:
+    scores = torch.rand(50, 1, 16, 16, generator=generator())
+    cells = scores[:, 0].unfold(1, 4, 4).unfold(2, 4, 4).flatten(3)
+    x, y = PatchSelector("multi", grid=True, pixel="best")(scores, 16, generator())
+    frame = torch.arange(50)[:, None]
+    assert torch.equal(scores[frame, 0, y, x], cells[frame, y // 4, x // 4].amax(-1))
+    x, y = PatchSelector("multi", grid=True, pixel="best")(scores, 32, generator())  # every cell twice
+    places = (16 * y + x).unflatten(1, (2, 16)).sort(dim=2).values
+    assert torch.equal(places[:, 0].diff(dim=1) > 0, torch.ones(50, 15, dtype=torch.bool))
+    assert float((places[:, 1] == places[:, 0]).all(dim=1).float().mean()) < 0.1, "later turns must look elsewhere"
+
+
 def test_multi_follows_the_scores() -> None:
     scores = torch.zeros(4000, 1, 8, 8)
     scores[:, :, 1:3, 1:3] = 1.0
     scores[:, :, 5:7, 5:7] = 3.0
-    x, _ = PatchSelector("multi", aligned=True)(scores, 1, generator())
+    x, _ = PatchSelector("multi", pixel="drawn")(scores, 1, generator())
     share = float((x >= 4).float().mean())
     assert abs(share - 0.75) < 0.03  # standard deviation 0.007
-    x, y = PatchSelector("multi", aligned=True)(scores, 2, generator())
+    x, y = PatchSelector("multi", pixel="drawn")(scores, 2, generator())
     assert bool((x[:, 0] // 4 != x[:, 1] // 4).all()), "a cell was used twice"
     assert bool(((x % 4 >= 1) & (x % 4 <= 2) & (y % 4 >= 1) & (y % 4 <= 2)).all())
 
@@ -185,7 +198,7 @@ def test_nms_keeps_quadrants_apart() -> None:
 @pytest.mark.parametrize("grid", [True, False])
 @pytest.mark.parametrize("method", CELL_METHODS)
 def test_more_patches_than_cells_begin_again(method: str, grid: bool) -> None:
-    x, y = PatchSelector(method, grid, aligned=True)(torch.rand(2, 1, 16, 16, generator=generator()), 37, generator())
+    x, y = PatchSelector(method, grid, pixel="drawn")(torch.rand(2, 1, 16, 16, generator=generator()), 37, generator())
     cells = y // 4 * 4 + x // 4
     for row in cells:
         assert len(set(row[:16].tolist())) == len(set(row[16:32].tolist())) == 16
@@ -194,6 +207,8 @@ def test_more_patches_than_cells_begin_again(method: str, grid: bool) -> None:
 def test_unknown_method_lists_the_known() -> None:
     with pytest.raises(InputError, match="'multinomial'.*multi, topk, nms, 3xrandom, random"):
         PatchSelector("multinomial")
+    with pytest.raises(InputError, match="'aligned'.*shifted, drawn, best"):
+        PatchSelector(pixel="aligned")
 
 
 @pytest.mark.parametrize(
