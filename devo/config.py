@@ -12,6 +12,8 @@ import yaml
 
 from devo.errors import InputError
 
+PIXELS = ("shifted", "drawn", "best")
+"""Values of `SCORER_EVAL_PIXEL`, see `devo.selector.PatchSelector`."""
 DEFAULTS: dict[str, Any] = {
     # keyframes held before the buffers grow (they double on demand)
     "BUFFER_SIZE": 4096,
@@ -74,7 +76,7 @@ _AT_LEAST = {
     "KEYFRAME_INDEX": 2, "KEYFRAME_THRESH": 0.0, "MOTION_DAMPING": 0.0, "RING_SIZE": 0,
     "INITIAL_INV_DEPTH": 0.0, "INITIAL_UPDATES": 1, "START_ROUNDS": 0, "PROBE_FLOW": 0.0,
 }
-_CHOICES = {"SCORER_EVAL_PIXEL": ("shifted", "drawn", "best"), "STILL_FRAMES": ("interpolate", "hold")}
+_CHOICES = {"SCORER_EVAL_PIXEL": PIXELS, "STILL_FRAMES": ("interpolate", "hold")}
 
 
 def _coerce(key: str, value: Any) -> Any:

@@ -46,10 +46,12 @@ def initialize(tracker: DEVO) -> None:
     tracker.is_initialized = True
     mirror, rounds = getattr(tracker.cfg, "MIRROR_TEST", False), getattr(tracker.cfg, "START_ROUNDS", 0)
     factors = (REVERSED,) * mirror + RESHAPED * (rounds > 0)
-    gain = CLEAR_GAIN if rounds > 0 else 1.0
     _solve(tracker)
+    if not factors:
+        return
+    gain = CLEAR_GAIN if rounds > 0 else 1.0
     best, replaced, is_reversed = _Solution.of(tracker), 0, 0
-    for _ in range(max(rounds, 1) if factors else 0):
+    for _ in range(max(rounds, 1)):
         others = {factor: _solve_from(tracker, best, factor) for factor in factors}
         factor = min(others, key=lambda key: others[key].cost)
         if not others[factor].cost < gain * best.cost:

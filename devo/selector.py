@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from devo.config import PIXELS
 from devo.errors import InputError
 from devo.extractor import channels_last_frames
 
@@ -15,7 +16,6 @@ NMS_RADIUS = 1.5
 NMS_IOU = 0.4
 EPSILON = 1e-7
 METHODS = ("multi", "topk", "nms", "3xrandom", "random")
-PIXELS = ("shifted", "drawn", "best")
 
 
 class Scorer(nn.Module):

@@ -22,7 +22,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -144,11 +144,10 @@ def depth_errors(observables: Any, scale: float, simulated: Any) -> tuple[tuple[
         The medians over the points of good quality and over the cleaned cloud (NaN where there are none), and the
         size of the cleaned cloud.
     """
-    from dataclasses import replace
-
     import numpy as np
     import torch
 
+    from evals.image_metrics import summarise_depth_errors
     from utils.clouds.filters import clean_cloud
     from utils.export_options import ExportOptions
     from utils.export_products import observables_to_cloud
@@ -159,14 +158,11 @@ def depth_errors(observables: Any, scale: float, simulated: Any) -> tuple[tuple[
     stamps, host = np.unique(observables.t_us, return_inverse=True)
     column, row = np.rint(observables.pixel_xy).astype(int).T
     truth = torch.cat([simulated.depth(stamps[i:i + 8]) for i in range(0, len(stamps), 8)])[host, row, column].numpy()
-    error = np.abs(scale * observables.depths - truth) / np.where(truth > 0, truth, np.nan)
+    error = (scale * observables.depths - truth) / np.where(truth > 0, truth, np.nan)
     cloud = replace(cloud, scalars={**cloud.scalars, "relative_error": error})
-    medians, size = [], 0
-    for steps in (["quality"], ExportOptions(datapath="").cleanup_steps()):
-        kept = clean_cloud(cloud, steps)[0].scalars["relative_error"]
-        medians.append(float(np.nanmedian(kept)) if np.isfinite(kept).any() else float("nan"))
-        size = len(kept)
-    return (medians[0], medians[1]), size
+    good, cleaned = (clean_cloud(cloud, steps)[0].scalars["relative_error"]
+                     for steps in (["quality"], ExportOptions(datapath="").cleanup_steps()))
+    return (summarise_depth_errors(good).median, summarise_depth_errors(cleaned).median), len(cleaned)
 
 
 def summarise(scores: Sequence[Score], variant: str) -> dict[str, Any]:
