@@ -28,6 +28,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--minutes", type=float, default=None, help="stop (and save) after this wall-clock time")
     add("--threads", type=int, default=None, help="CPU threads of the trainer")
     add("--device", default=None, help="cpu or cuda (default: cuda where available)")
+    add("--simulators", type=int, default=1, help="background processes that simulate clips")
     add("--no-background", action="store_true", help="simulate clips in the training process, when needed")
     add("--log-every", type=int, default=20)
     add("--validate-every", type=int, default=200)

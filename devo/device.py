@@ -46,3 +46,11 @@ def fast_dtype(device: torch.device, mixed_precision: bool) -> torch.dtype:
 def autocast(device: torch.device, dtype: torch.dtype) -> contextlib.AbstractContextManager[None]:
     """Autocast to `dtype` on `device`; a no-op for float32."""
     return torch.autocast(device.type, dtype=dtype, enabled=dtype != torch.float32)
+
+
+def random_home(generator: torch.Generator | None) -> torch.device:
+    """Where random numbers are drawn: with the generator, by default on the CPU, whatever device uses them.
+
+    So the same seed chooses the same patches on every device.
+    """
+    return torch.device("cpu") if generator is None else generator.device

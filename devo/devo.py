@@ -238,7 +238,7 @@ class DEVO(PatchGraph):
         if self.is_initialized:
             return torch.full_like(start, float(self.patches_[self.n - 3:self.n, :, 2].median()))
         constant = getattr(self.cfg, "INITIAL_INV_DEPTH", 0.0)
-        return torch.full_like(start, constant) if constant > 0 else torch.rand_like(start)
+        return torch.full_like(start, constant) if constant > 0 else torch.rand(start.shape).to(start)
 
     def _predict_pose(self) -> Tensor:
         previous = SE3(self.poses_[self.n - 1])

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from devo.altcorr import patchify
+from devo.device import random_home
 from devo.errors import InputError
 from devo.extractor import BasicEncoder4, channels_last_frames
 from devo.selector import PatchSelector, Scorer, event_gradient
@@ -151,11 +152,11 @@ class Patchifier(nn.Module):
         if min(height, width) < 3:
             found = f"{images.shape[-1]}x{images.shape[-2]} pixels"
             raise InputError(f"frames of {found} are too small; expected at least 9x9 (3x3 feature pixels)")
-        frames = images.shape[0]
+        frames, home = images.shape[0], random_home(generator)
         if self.patch_selector == "random":
-            x = torch.randint(1, width - 1, (frames, count), generator=generator, device=images.device)
-            y = torch.randint(1, height - 1, (frames, count), generator=generator, device=images.device)
-            return x, y, None
+            x = torch.randint(1, width - 1, (frames, count), generator=generator, device=home)
+            y = torch.randint(1, height - 1, (frames, count), generator=generator, device=home)
+            return x.to(images.device), y.to(images.device), None
         if self.patch_selector == "gradient":
             selector = PatchSelector("3xrandom") if self.training else selector
             x, y = selector(event_gradient(images), count, generator)
@@ -166,8 +167,8 @@ class Patchifier(nn.Module):
             return x + 1, y + 1, None
         rows, columns = scores.shape[-2:]
         candidates = (frames, CANDIDATE_FACTOR * count)
-        x = torch.randint(0, columns, candidates, generator=generator, device=images.device)
-        y = torch.randint(0, rows, candidates, generator=generator, device=images.device)
+        x = torch.randint(0, columns, candidates, generator=generator, device=home).to(images.device)
+        y = torch.randint(0, rows, candidates, generator=generator, device=home).to(images.device)
         value = scores.flatten(1).gather(1, y * columns + x)
         keep = value.argsort(dim=1, stable=True)[:, -count:]
         return x.gather(1, keep) + 1, y.gather(1, keep) + 1, value.gather(1, keep)

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from devo.config import PIXELS
+from devo.device import random_home
 from devo.errors import InputError
 from devo.extractor import channels_last_frames
 
@@ -124,8 +125,9 @@ class PatchSelector:
         quadrant = torch.arange(parts, device=maps.device)[:, None]
         x0, x1 = _span(quadrant % splits, w, splits)
         y0, y1 = _span(quadrant // splits, h, splits)
-        x = x0 + (torch.rand(size, generator=generator, device=maps.device) * (x1 - x0)).long().clamp(max=x1 - x0 - 1)
-        y = y0 + (torch.rand(size, generator=generator, device=maps.device) * (y1 - y0)).long().clamp(max=y1 - y0 - 1)
+        across, down = torch.rand(2, *size, generator=generator, device=random_home(generator)).to(maps.device)
+        x = x0 + (across * (x1 - x0)).long().clamp(max=x1 - x0 - 1)
+        y = y0 + (down * (y1 - y0)).long().clamp(max=y1 - y0 - 1)
         if factor > 1:
             value = maps.flatten(1).gather(1, (y * w + x).flatten(1)).view(size)
             keep = value.argsort(dim=2, stable=True)[..., -per_part:]
@@ -227,8 +229,8 @@ def _draw(weight: Tensor, count: int, generator: torch.Generator | None) -> Tens
     rounds = [min(cells, count - done) for done in range(0, count, cells)]
     picks = []
     for size in rounds:
-        race = torch.empty_like(weight).exponential_(1.0, generator=generator)
-        picks.append(torch.topk(weight / race, size, dim=-1).indices)
+        race = torch.empty_like(weight, device=random_home(generator)).exponential_(1.0, generator=generator)
+        picks.append(torch.topk(weight / race.to(weight.device), size, dim=-1).indices)
     return picks[0] if len(picks) == 1 else torch.cat(picks, dim=-1)
 
 

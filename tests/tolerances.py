@@ -71,3 +71,10 @@ EMVS_PIXELS = 5e-5  # event -> plane -> event; 1.5e-5
 
 # --- training -----------------------------------------------------------------------------------------------
 JOINED_CLIPS = 1e-3  # joined against single clips after 4 updates, pixels and poses; observed below 1e-4
+
+# --- CUDA against CPU, float32, H100 ------------------------------------------------------------------------
+GPU_CORRELATION = 1e-5  # of the largest value or gradient
+GPU_BA = 1e-3  # of the largest value
+GPU_TRAINING_LOSS = 1e-3  # relative, each loss of a step
+GPU_TRAINING_GRADIENT = 1e-2  # all gradients together, relative norm
+GPU_TRACKER = 1e-2  # rotation [rad] and position over the largest position

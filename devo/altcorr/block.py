@@ -9,21 +9,23 @@ import torch
 from torch import Tensor
 
 from devo.altcorr.correlation import corr, draw_kept_edges
-from devo.altcorr.volumes import Volume, look_up, volume_shape
+from devo.altcorr.volumes import MAX_VOLUME_ELEMENTS, Volume, look_up, volume_shape
 from devo.altcorr.windows import check_edges
 from devo.errors import InputError
-from devo.kernels import cuda_kernel
+from devo.kernels import cuda_kernel, kernel_mode
 
 MAX_VOLUME_BYTES = 1 << 31
 """Largest correlation volumes kept in memory; bigger samples are correlated edge by edge instead."""
+GPU_VOLUME_SHARE = 0.25
+"""The same on other devices, as a share of the memory that is free there."""
 
 
 class CorrBlock:
     """Pyramid correlation of fixed maps at positions that change from call to call.
 
-    On the CPU all products of patch and map pixels of each clip are computed once (`devo.altcorr.volumes`), which makes
-    every further call and its backward pass cheap; where they would exceed `MAX_VOLUME_BYTES`, and on other devices,
-    each call runs `corr` per level. Both give the same result up to the rounding of sums.
+    All products of patch and map pixels of each clip are computed once (`devo.altcorr.volumes`), which makes every
+    further call and its backward pass cheap; where they would exceed `MAX_VOLUME_BYTES` (on other devices a share of
+    the free memory), each call runs `corr` per level. Both give the same result up to the rounding of sums.
 
     Args:
         fmap: (1, F, C, H, W) feature maps, clip after clip.
@@ -66,10 +68,11 @@ class CorrBlock:
             self.gmap = gmap.to(compute)
             pooled = [torch.nn.functional.avg_pool2d(fmap[0], n, n)[None] if n > 1 else fmap for n in self.levels]
             self.pyramid = [level.to(compute) for level in pooled]
-            size = sum(math.prod(volume_shape(gmap, level, radius, clips)) for level in self.pyramid) * compute.itemsize
             self.volumes: list[Volume] | None = None
-            twin = cuda_kernel("altcorr", fmap, gmap) is None
-            if twin and fmap.device.type == "cpu" and size <= MAX_VOLUME_BYTES:
+            elements = [math.prod(volume_shape(gmap, level, radius, clips)) for level in self.pyramid]
+            if kernel_mode() == "cuda":
+                cuda_kernel("altcorr", fmap, gmap)  # refuses what has no extension
+            elif max(elements) < MAX_VOLUME_ELEMENTS and sum(elements) * compute.itemsize <= _memory(fmap.device):
                 self.volumes = [Volume(self.gmap, level, radius, clips) for level in self.pyramid]
 
     def __call__(self, ii: Tensor, jj: Tensor, coords: Tensor) -> Tensor:
@@ -109,3 +112,10 @@ class CorrBlock:
             for level, n in zip(self.pyramid, self.levels, strict=True)
         ]
         return torch.stack(levels, dim=-1).flatten(2)
+
+
+def _memory(device: torch.device) -> float:
+    """Bytes that correlation volumes may take on a device."""
+    if device.type != "cuda":
+        return MAX_VOLUME_BYTES
+    return GPU_VOLUME_SHARE * torch.cuda.mem_get_info(device)[0]

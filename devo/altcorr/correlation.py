@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devo.altcorr.windows import blend, check_edges, pixel_rows, split_coords, spread, window_rows
+from devo.device import random_home
 from devo.errors import InputError
 from devo.kernels import cuda_kernel
 
@@ -55,7 +56,7 @@ def corr(
     _check(fmap1, fmap2, coords, ii, jj, radius, dropout)
     extension = cuda_kernel("altcorr", fmap1, fmap2, coords, ii, jj)
     if extension is not None:
-        return extension.corr(fmap1, fmap2, coords, ii, jj, radius, dropout)
+        return extension.corr(fmap1, fmap2, coords, ii, jj, radius, dropout, generator=generator)
     keep = None
     if dropout < 1 and torch.is_grad_enabled() and (fmap1.requires_grad or fmap2.requires_grad):
         keep = draw_kept_edges(len(ii), dropout, coords.device, generator)
@@ -68,7 +69,8 @@ def corr(
 
 def draw_kept_edges(edges: int, keep: float, device: torch.device, generator: torch.Generator | None) -> Tensor:
     """Numbers (int64, increasing) of the edges that an independent coin of probability `keep` selects."""
-    return torch.nonzero(torch.rand(edges, generator=generator, device=device) < keep).squeeze(1)
+    coins = torch.rand(edges, generator=generator, device=random_home(generator))
+    return torch.nonzero(coins < keep).squeeze(1).to(device)
 
 
 def _check(fmap1: Tensor, fmap2: Tensor, coords: Tensor, ii: Tensor, jj: Tensor, radius: int, dropout: float) -> None:

@@ -16,8 +16,10 @@ from torch.autograd.function import once_differentiable
 
 from devo.altcorr.windows import split_coords, spread
 
-CHUNK_EDGES = 1024
-"""Edges looked up at a time, so that temporaries stay in the cache."""
+CHUNK_EDGES = {"cpu": 1024, "cuda": 1 << 17}
+"""Edges looked up at a time: temporaries stay in the cache of a CPU, and few calls are made on a GPU."""
+MAX_VOLUME_ELEMENTS = 1 << 31
+"""Products of one volume: they are numbered in 32 bits."""
 
 
 class Volume:
@@ -172,8 +174,7 @@ class _Lookup(torch.autograd.Function):
     ) -> Tensor:
         side = volumes[0].side - 1
         out = torch.empty(len(kk), side, side, coords.shape[-1], len(volumes), dtype=dtype, device=coords.device)
-        for first in range(0, len(kk), CHUNK_EDGES):
-            part = slice(first, first + CHUNK_EDGES)
+        for part in _chunks(kk):
             for level, (volume, scale) in enumerate(zip(volumes, scales, strict=True)):
                 volume.look_up(coords[part] / scale, kk[part], jj[part], out[part, ..., level])
         if keep is not None:
@@ -188,8 +189,12 @@ class _Lookup(torch.autograd.Function):
         coords, kk, jj, keep = ctx.saved_tensors
         if keep is not None:
             grad = grad[keep]
-        for first in range(0, len(kk), CHUNK_EDGES):
-            part = slice(first, first + CHUNK_EDGES)
+        for part in _chunks(kk):
             for level, (volume, scale) in enumerate(zip(ctx.volumes, ctx.scales, strict=True)):
                 volume.add_gradient(coords[part] / scale, kk[part], jj[part], grad[part, ..., level])
         return (*[None] * 7, *(grad.new_zeros((), dtype=volume.dtype) for volume in ctx.volumes))
+
+
+def _chunks(edges: Tensor) -> list[slice]:
+    step = CHUNK_EDGES.get(edges.device.type, CHUNK_EDGES["cpu"])
+    return [slice(first, first + step) for first in range(0, len(edges), step)]

@@ -399,10 +399,12 @@ def test_batches_depend_on_the_step_only(tmp_path: Path) -> None:
     assert [first.window(step) for step in (0, 2, 4, 40)] == [(0, 1), (1, 2), (2, 3), (20, 21)]
 
 
-def test_background_process_gives_the_same_batches(tmp_path: Path) -> None:
-    inline, background = make_pool(tmp_path / "a"), make_pool(tmp_path / "b", producer="background")
+@pytest.mark.parametrize("processes", [1, 3])
+def test_background_processes_give_the_same_batches(tmp_path: Path, processes: int) -> None:
+    inline = make_pool(tmp_path / "a")
+    background = make_pool(tmp_path / "b", producer="background", processes=processes)
     try:
-        for step in (0, 3):
+        for step in (0, 3, 7):
             expected, found = inline.batch(step), background.batch(step)
             assert all(torch.equal(a, b) for a, b in zip(found.tensors(), expected.tensors()))
     finally:

@@ -77,9 +77,9 @@ def settings_from_options(options: argparse.Namespace) -> TrainSettings:
     names = {item.name for item in fields(TrainSettings)} - {"loss", "augment", "preset", "shard_size"}
     changes = {name: value for name, value in vars(options).items() if name in names and value is not None}
     if options.size:
-        changes["sizes"] = tuple(_size(text) for text in options.size)
+        changes["sizes"] = tuple(size_of(text) for text in options.size)
     if options.shard_size:
-        changes["shard_size"] = _size(options.shard_size)
+        changes["shard_size"] = size_of(options.shard_size)
     settings = TrainSettings.from_preset(options.preset, **changes)
     settings = replace(
         settings,
@@ -98,7 +98,12 @@ def settings_from_options(options: argparse.Namespace) -> TrainSettings:
     return settings
 
 
-def _size(text: str) -> tuple[int, int]:
+def size_of(text: str) -> tuple[int, int]:
+    """Height and width of `HxW`.
+
+    Raises:
+        InputError: not of that form, or no multiples of 4.
+    """
     try:
         height, width = (int(part) for part in text.lower().split("x"))
     except ValueError:
@@ -132,7 +137,11 @@ def _data(
     cache = Path(options.cache) if options.cache else Path(options.runs) / "cache"
     producer = "elsewhere" if rank else "inline" if options.no_background else "background"
     source = simulated_source(
-        settings, cache, producer=producer, start_step=start * int(os.environ.get("WORLD_SIZE", "1"))
+        settings,
+        cache,
+        producer=producer,
+        start_step=start * int(os.environ.get("WORLD_SIZE", "1")),
+        processes=options.simulators,
     )
     validation = validation_clips(cache, options.validation_clips) if rank == 0 and options.validation_clips else None
     return source, validation

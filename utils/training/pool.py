@@ -107,15 +107,27 @@ def load_shard(
 
 
 def _produce(
-    folder: Path, settings: ShardSettings, make: ShardMaker, position: Any, ahead: int, keep: int, nice: int
+    folder: Path,
+    settings: ShardSettings,
+    make: ShardMaker,
+    position: Any,
+    share: tuple[int, int],
+    keep: int,
+    nice: int,
 ) -> None:
-    """Background process: keep the shards up to `ahead` beyond the trainer's newest one on disk, delete old ones."""
+    """Background process `share[0]` of `share[1]`: makes every so-many-th shard before it is needed, deletes old ones.
+
+    Each process is one or two of its shards ahead of the trainer's newest one.
+    """
     import os
 
     if nice:
         os.nice(nice)
     torch.set_num_threads(1)
+    turn, processes = share
+    ahead = 2 * processes
     number = max(0, position.value - keep)
+    number += (turn - number) % processes
     while True:
         newest = position.value
         if newest < 0 or os.getppid() == 1:
@@ -126,7 +138,7 @@ def _produce(
         ensure_shard(folder, number, settings, make)
         if keep > 0 and number - ahead - keep >= 0:
             shard_path(folder, number - ahead - keep).unlink(missing_ok=True)
-        number += 1
+        number += processes
 
 
 class ClipPool:
@@ -144,6 +156,7 @@ class ClipPool:
         shards: pool size. reuse: mean uses of a clip. first: shards needed before the first step.
         producer: `background` (a process of its own), `inline` (this process makes shards when they are needed), or
             `elsewhere` (another trainer with the same cache makes them, this one waits).
+        processes: number of background processes.
     """
 
     def __init__(
@@ -162,6 +175,7 @@ class ClipPool:
         producer: str = "background",
         start_step: int = 0,
         nice: int = 0,
+        processes: int = 1,
     ) -> None:
         self.folder, self.settings, self.make = folder, settings, make
         self.clips, self.frames_per_clip, self.sizes, self.shards, self.reuse = clips, frames, sizes, shards, reuse
@@ -170,16 +184,22 @@ class ClipPool:
         self.repaired = 0
         self._memory: OrderedDict[int, TrainingClips] = OrderedDict()
         self._check_writable()
-        self._process: Any = None
+        self._processes: list[Any] = []
         self._position: Any = None
         self.producer = producer
         if producer == "background":
             context = multiprocessing.get_context("spawn")
             self._position = context.Value("q", self.window(start_step)[1])
-            self._process = context.Process(
-                target=_produce, daemon=True, args=(folder, settings, make, self._position, 2, shards + 2, nice)
-            )
-            self._process.start()
+            self._processes = [
+                context.Process(
+                    target=_produce,
+                    daemon=True,
+                    args=(folder, settings, make, self._position, (turn, processes), shards + 2, nice),
+                )
+                for turn in range(processes)
+            ]
+            for process in self._processes:
+                process.start()
 
     def _check_writable(self) -> None:
         """Fail at once, not after minutes, where the cache cannot be written."""
@@ -218,10 +238,11 @@ class ClipPool:
             return
         start = time.monotonic()
         while not path.is_file():
-            if self._process is not None and not self._process.is_alive():
+            ended = [process.exitcode for process in self._processes if not process.is_alive()]
+            if ended:
                 raise DevoError(
-                    f"the process that simulates training clips ended (exit code {self._process.exitcode}) before it "
-                    f"wrote {path}; its message is above. Too little memory? Try fewer --shard-clips"
+                    f"a process that simulates training clips ended (exit code {ended[0]}) before {path} was written; "
+                    "its message is above. Too little memory? Try fewer --shard-clips"
                 )
             time.sleep(POLL_SECONDS)
         self.waited_seconds += time.monotonic() - start
@@ -239,10 +260,11 @@ class ClipPool:
         return augment(raw, self.frames_per_clip, size, self.augment_settings, generator)
 
     def close(self) -> None:
-        """Stop the background process."""
-        if self._process is not None:
+        """Stop the background processes."""
+        if self._processes:
             self._position.value = -1
-            self._process.join(timeout=10)
-            if self._process.is_alive():
-                self._process.terminate()
-            self._process = None
+        for process in self._processes:
+            process.join(timeout=10)
+            if process.is_alive():
+                process.terminate()
+        self._processes = []

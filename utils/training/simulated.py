@@ -46,9 +46,14 @@ def cache_folder(root: Path, settings: ShardSettings) -> Path:
 
 
 def simulated_source(
-    settings: TrainSettings, cache: Path, *, producer: str = "background", start_step: int = 0
+    settings: TrainSettings,
+    cache: Path,
+    *,
+    producer: str = "background",
+    start_step: int = 0,
+    processes: int = 1,
 ) -> ClipPool:
-    """Pool of simulated clips for a training run, cached below `cache`."""
+    """Pool of simulated clips for a training run, cached below `cache`, made by so many background processes."""
     shards = shard_settings(settings)
     return ClipPool(
         cache_folder(cache, shards),
@@ -63,6 +68,7 @@ def simulated_source(
         producer=producer,
         start_step=start_step,
         nice=5,
+        processes=processes,
     )
 
 
