@@ -18,13 +18,14 @@ def channels_last_frames(images: Tensor) -> Tensor:
 class FrameNorm(nn.InstanceNorm2d):
     """Instance normalisation (no parameters) that keeps the channels-last layout of its input.
 
-    The framework's kernel rearranges channels-last maps first, which costs more than the convolution before it;
-    batch statistics of a single frame are the same thing and need no rearrangement.
+    On CPUs the framework's kernel rearranges channels-last maps first, which costs more than the convolution before it;
+    batch statistics of a single frame are the same thing and need no rearrangement. On GPUs one call per frame would
+    cost more.
     """
 
     def forward(self, x: Tensor) -> Tensor:
         """Map `(N, C, H, W)` to the same shape with zero mean and unit (biased) variance per frame and channel."""
-        if x.is_contiguous() or not x.is_contiguous(memory_format=torch.channels_last):
+        if x.is_cuda or x.is_contiguous() or not x.is_contiguous(memory_format=torch.channels_last):
             return super().forward(x)
         frames = [functional.batch_norm(frame, None, None, training=True, eps=self.eps) for frame in x.split(1)]
         return frames[0] if len(frames) == 1 else torch.cat(frames)

@@ -1,8 +1,8 @@
 """Which implementation of a kernel runs: the CUDA extension or its pure-torch twin.
 
 `DEVO_KERNELS` decides: `torch` always takes the twin, `cuda` insists on the extension, `auto` (default) takes
-the extension for CUDA tensors where it is installed and the twin everywhere else. Nothing is compiled here;
-an extension is an already built module that is imported when it is first asked for.
+the extension for CUDA tensors where it is built and the twin everywhere else. Nothing is compiled here; an
+extension is a module that loads an already built library (see `devo.cuda_library`) when it is first asked for.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from devo.errors import InputError
 
 MODES = ("auto", "torch", "cuda")
-EXTENSIONS = {"altcorr": "devo_cuda_corr", "fastba": "devo_cuda_ba"}
+EXTENSIONS = {"altcorr": "devo.altcorr.extension", "fastba": "devo.fastba.extension"}
 
 
 def kernel_mode() -> str:
@@ -48,7 +48,7 @@ def cuda_kernel(name: str, *tensors: torch.Tensor) -> ModuleType | None:
         tensors: the operands; the extension is only considered when all of them live on a CUDA device.
 
     Raises:
-        InputError: `DEVO_KERNELS=cuda`, but the extension is not installed or an operand is not on a CUDA device.
+        InputError: `DEVO_KERNELS=cuda`, but the extension is not built or an operand is not on a CUDA device.
     """
     mode = kernel_mode()
     if mode == "torch":
@@ -56,7 +56,7 @@ def cuda_kernel(name: str, *tensors: torch.Tensor) -> ModuleType | None:
     on_cuda = all(tensor.is_cuda for tensor in tensors)
     extension = _extension(name) if on_cuda else None
     if mode == "cuda" and extension is None:
-        missing = f"the extension {EXTENSIONS[name]} is not installed"
+        missing = f"the extension {EXTENSIONS[name]} is not built"
         found = missing if on_cuda else "the tensors are not on a CUDA device"
         raise InputError(f"DEVO_KERNELS=cuda, but {found}; use DEVO_KERNELS=auto or torch for the torch twin")
     return extension

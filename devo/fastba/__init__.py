@@ -1,6 +1,6 @@
 """Fast bundle adjustment of the tracker, edge neighbours and plain reprojection: CUDA extension or torch twin.
 
-The torch twin in `devo.fastba.torch_twin` and `devo.fastba.neighbors` is the specification; an extension offers
+The torch twin in `devo.fastba.torch_twin` and `devo.fastba.edge_neighbors` is the specification; the extension offers
 `ba`, `neighbors` and `reproject` with the same arguments and results.
 """
 
@@ -60,7 +60,8 @@ def BA(  # noqa: N802 - the published name
         per_frame_intrinsics: use the camera of each frame instead of row 0 for all.
         accurate: set up and solve in float64 over blocks of frame pairs, several times faster on large problems;
             otherwise in the dtype of the state in the order of the published kernel, whose rounding errors are
-            reproduced. The tracker uses the former; the two agree where the problem is well determined.
+            reproduced. The tracker uses the former; the two agree where the problem is well determined. The CUDA
+            extension always works in float64.
 
     Returns:
         `BAResult`, see there.

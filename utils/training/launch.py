@@ -19,6 +19,7 @@ from devo.data_readers.base import ClipSource, TrainingClips
 from devo.enet import eVONet
 from devo.errors import DevoError, InputError
 from utils.atomic import atomic_path
+from utils.training.ahead import BatchesAhead
 from utils.training.settings import TrainSettings
 from utils.training.simulated import simulated_source, validation_clips
 from utils.training.trainer import RunSettings, Trainer, check_dimensions, training_state
@@ -47,6 +48,8 @@ def launch(options: argparse.Namespace) -> int:
         network.load_state_dict(weights)
     start = int(training_state(resume).get("steps", 0)) if resume else 0
     source, validation = _data(options, settings, start, rank)
+    if device.type == "cuda":
+        source = BatchesAhead(source, world)
     trainer = Trainer(network, settings, run, source, validation, report=_reporter(rank), rank=rank, world=world)
     try:
         if resume:
