@@ -123,7 +123,7 @@ def test_commands_run(command: str, workplace: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.slow
 def test_the_demo_runs(tmp_path: Path) -> None:
     done = subprocess.run(["bash", str(ROOT / "scripts" / "demo.sh")], capture_output=True, text=True, timeout=1800,
-                          env={**os.environ, "DEMO_SECONDS": "2", "DEMO_DIR": str(tmp_path)}, cwd=tmp_path)
+                          env={**os.environ, "DEMO_SECONDS": "3", "DEMO_DIR": str(tmp_path)}, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "path: ATE" in done.stdout and "no warnings" in done.stdout
     paths = re.findall(r"^(?:cloud|picture|HTML view) +(/\S+)", done.stdout, flags=re.M)
