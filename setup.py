@@ -34,7 +34,7 @@ def find_nvcc() -> str:
 
 def targets(nvcc: str) -> list[str]:
     """Options of nvcc: machine code for every architecture, and PTX of the newest for later GPUs."""
-    wanted = os.environ.get("DEVO_CUDA_ARCH", "").replace(",", ";").replace(";", " ").split()
+    wanted = os.environ.get("DEVO_CUDA_ARCH", "").replace(",", " ").replace(";", " ").split()
     if not wanted:
         listed = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=True).stdout.split()
         wanted = [number for number in USUAL_ARCHITECTURES if f"compute_{number}" in listed]

@@ -208,8 +208,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     print("; ".join(f"{name}: {value}" for name, value in about.items()), end="\n\n")
     print_table(rows)
     if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps(about | {"rows": rows}, indent=1), encoding="utf-8")
+        from utils.atomic import atomic_path
+
+        with atomic_path(args.json) as temporary:
+            temporary.write_text(json.dumps(about | {"rows": rows}, indent=1), encoding="utf-8")
     return 0
 
 

@@ -122,7 +122,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("| " + " | ".join([*case, str(row["edges"]), *numbers, f"{1e3 / row['total']:.2f}",
                                  f"{row['peak_mib']:.0f}"]) + " |", flush=True)
     if args.json:
-        args.json.write_text(json.dumps(rows, indent=2))
+        from utils.atomic import atomic_path
+
+        with atomic_path(args.json) as temporary:
+            temporary.write_text(json.dumps(rows, indent=2))
     return 0
 
 

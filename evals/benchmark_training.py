@@ -73,17 +73,18 @@ def simulate(args: argparse.Namespace) -> tuple[Any, float]:
     """Training clips, and how many a second the simulator makes (textures painted before)."""
     import torch
 
-    from devo.data_readers.base import TrainingClips
-    from utils.simulator.training import sample_clips
+    from devo.device import resolve_device
     from utils.training.launch import size_of
+    from utils.training.simulated import sampled_clips
+
+    device = resolve_device(args.simulate_on)
 
     def sample(count: int, seed: int) -> Any:
         generator = torch.Generator().manual_seed(seed)
-        return sample_clips(count, args.frames, *size_of(args.size), generator=generator, device=args.simulate_on)
+        return sampled_clips(count, args.frames, *size_of(args.size), generator=generator, device=device)
 
     sample(1, 0)
-    seconds, made = timed(lambda: sample(args.simulate, 1), torch.device(args.simulate_on))
-    clips = TrainingClips(made.voxels, made.world_T_cam, made.inv_depths, made.intrinsics)
+    seconds, clips = timed(lambda: sample(args.simulate, 1), device)
     return clips.with_unit_depth(), args.simulate / seconds
 
 
@@ -135,7 +136,7 @@ def timed(call: Callable[[], Any], device: Any) -> tuple[float, Any]:
     import torch
 
     def finished() -> float:
-        if torch.device(device).type == "cuda":
+        if device.type == "cuda":
             torch.cuda.synchronize(device)
         return time.perf_counter()
 

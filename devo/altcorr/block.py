@@ -25,7 +25,8 @@ class CorrBlock:
 
     All products of patch and map pixels of each clip are computed once (`devo.altcorr.volumes`), which makes every
     further call and its backward pass cheap; where they would exceed `MAX_VOLUME_BYTES` (on other devices a share of
-    the free memory), each call runs `corr` per level. Both give the same result up to the rounding of sums.
+    the free memory) and with `DEVO_KERNELS=cuda`, each call runs `corr` per level. Both give the same result up to the
+    rounding of sums.
 
     Args:
         fmap: (1, F, C, H, W) feature maps, clip after clip.

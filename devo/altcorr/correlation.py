@@ -55,11 +55,11 @@ def corr(
     """
     _check(fmap1, fmap2, coords, ii, jj, radius, dropout)
     extension = cuda_kernel("altcorr", fmap1, fmap2, coords, ii, jj)
-    if extension is not None:
-        return extension.corr(fmap1, fmap2, coords, ii, jj, radius, dropout, generator=generator)
     keep = None
     if dropout < 1 and torch.is_grad_enabled() and (fmap1.requires_grad or fmap2.requires_grad):
         keep = draw_kept_edges(len(ii), dropout, coords.device, generator)
+    if extension is not None:
+        return extension.corr(fmap1, fmap2, coords, ii, jj, radius, keep)
     side, patch, channels = 2 * radius + 2, fmap1.shape[-1], fmap1.shape[2]
     elements = CHUNK_ELEMENTS["cpu" if fmap1.device.type == "cpu" else "other"]
     chunk = chunk_edges or max(1, elements // max(1, side * side * patch * patch * channels))

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devo.altcorr.correlation import draw_kept_edges
 from devo.cuda_library import CudaLibrary
 from devo.errors import InputError
 
@@ -32,23 +31,18 @@ def corr(
     coords: Tensor,
     ii: Tensor,
     jj: Tensor,
-    radius: int = 1,
-    dropout: float = 1,
-    *,
-    generator: torch.Generator | None = None,
+    radius: int,
+    keep: Tensor | None,
 ) -> Tensor:
     """Correlate patch pixels with map windows; arguments (already checked) and result of `devo.altcorr.corr`.
 
-    An edge whose patch or frame does not exist gives NaN and no gradient. With equal generators the same edges take
-    part in the backward pass as in the twin.
+    `keep` holds the numbers (int64) of the edges that take part in the backward pass, None stands for all. An edge
+    whose patch or frame does not exist gives NaN and no gradient.
 
     Raises:
         InputError: the dtype of the maps has no kernel.
     """
     _check_dtype("corr", fmap1)
-    keep = None
-    if dropout < 1 and torch.is_grad_enabled() and (fmap1.requires_grad or fmap2.requires_grad):
-        keep = draw_kept_edges(len(ii), dropout, coords.device, generator)
     return _Corr.apply(fmap1, fmap2, coords.detach(), ii, jj, radius, keep)
 
 

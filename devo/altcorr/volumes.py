@@ -18,8 +18,8 @@ from devo.altcorr.windows import split_coords, spread
 
 CHUNK_EDGES = {"cpu": 1024, "cuda": 1 << 17}
 """Edges looked up at a time: temporaries stay in the cache of a CPU, and few calls are made on a GPU."""
-MAX_VOLUME_ELEMENTS = 1 << 31
-"""Products of one volume: they are numbered in 32 bits."""
+MAX_VOLUME_ELEMENTS = (1 << 31) - (1 << 12)
+"""Products of one volume: they and the zeros before them are numbered in 32 bits."""
 
 
 class Volume:

@@ -9,6 +9,7 @@ from torch import Tensor
 from devo.altcorr import corr, patchify
 from devo.errors import DevoError, InputError
 from tests.devo.cuda_backends import Kernels, assert_close
+from tests.devo.test_altcorr import random_problem
 from tests.tolerances import CUDA_CORRELATION
 
 DTYPES = [torch.float32, torch.float64, torch.float16, torch.bfloat16]
@@ -21,12 +22,7 @@ def problem(device: torch.device, dtype: torch.dtype = torch.float64, edges: int
             patch: int = 3, size: tuple[int, int] = (9, 12), coord_dtype: torch.dtype = torch.float32,
             seed: int = 0) -> tuple[Tensor, ...]:
     """Patches, maps, positions (a third of them outside), patch and frame of each edge."""
-    source = torch.Generator().manual_seed(seed)
-    fmap1 = torch.randn(1, 7, channels, patch, patch, generator=source, dtype=torch.float64)
-    fmap2 = torch.randn(1, 3, channels, *size, generator=source, dtype=torch.float64)
-    extent = torch.tensor([size[1], size[0]], dtype=torch.float64).view(1, 1, 2, 1, 1)
-    coords = (torch.rand(1, edges, 2, patch, patch, generator=source, dtype=torch.float64) * 2 - 0.5) * extent
-    ii, jj = (torch.randint(0, count, (edges,), generator=source) for count in (7, 3))
+    fmap1, fmap2, coords, ii, jj = random_problem(seed, edges, channels, patch, size)
     floats = fmap1.to(dtype), fmap2.to(dtype), coords.to(coord_dtype)
     return tuple(tensor.to(device) for tensor in (*floats, ii, jj))
 

@@ -17,8 +17,8 @@ from tests.conftest import REPOSITORY
 from tests.devo.worlds import make_world
 from tests.tolerances import GPU_BA, GPU_CORRELATION, GPU_TRACKER, GPU_TRAINING_GRADIENT, GPU_TRAINING_LOSS
 from utils.eval_utils import track
-from utils.simulator.training import sample_clips
 from utils.training.settings import TrainSettings
+from utils.training.simulated import sampled_clips
 from utils.training.step import TrainingStep, plan_step
 
 pytestmark = [
@@ -35,8 +35,7 @@ def _exact(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def clips(count: int, frames: int, height: int, width: int) -> TrainingClips:
-    made = sample_clips(count, frames, height, width, generator=torch.Generator().manual_seed(4))
-    return TrainingClips(made.voxels, made.world_T_cam, made.inv_depths, made.intrinsics).with_unit_depth()
+    return sampled_clips(count, frames, height, width, generator=torch.Generator().manual_seed(4)).with_unit_depth()
 
 
 def settings(mixed: bool) -> Config:

@@ -26,3 +26,5 @@ def test_one_row_per_batch_size(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_unusable_settings_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*SMALL, "--device", "tpu9"]) == 2
     assert capsys.readouterr().err.startswith("benchmark_training: device 'tpu9'")
+    assert main([*SMALL, "--simulate_on", "tpu9"]) == 2
+    assert capsys.readouterr().err.startswith("benchmark_training: device 'tpu9'")

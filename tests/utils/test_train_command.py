@@ -112,6 +112,7 @@ def test_unwritable_folders_are_refused(tmp_path: Path, capsys: pytest.CaptureFi
         (["--loss", "speed=1"], "unknown name 'speed'"),
         (["--loss", "pose=much"], "'much' is not a number"),
         (["--augment", "noise"], "'' is not a number"),
+        (["--simulators", "0"], "expected at least 1, or --no-background"),
     ],
 )
 def test_unusable_options_say_what_was_expected(arguments: list[str], message: str) -> None:

@@ -75,7 +75,8 @@ def settings_from_options(options: argparse.Namespace) -> TrainSettings:
     """Preset plus the options that were given.
 
     Raises:
-        InputError: unknown preset, loss or augmentation name, or a size that is not HxW in multiples of 4.
+        InputError: unknown preset, loss or augmentation name, a size that is not HxW in multiples of 4, or nothing that
+            simulates.
     """
     names = {item.name for item in fields(TrainSettings)} - {"loss", "augment", "preset", "shard_size"}
     changes = {name: value for name, value in vars(options).items() if name in names and value is not None}
@@ -91,6 +92,8 @@ def settings_from_options(options: argparse.Namespace) -> TrainSettings:
     )
     if options.data != "sim":
         return settings
+    if options.simulators < 1:
+        raise InputError(f"--simulators {options.simulators}: expected at least 1, or --no-background for none")
     height, width = settings.shard_size
     if any(h > height or w > width for h, w in settings.sizes):
         raise InputError(

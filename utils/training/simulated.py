@@ -6,6 +6,7 @@ import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -24,13 +25,21 @@ BANK_SIZE = 48
 
 def simulate_shard(settings: ShardSettings, number: int) -> TrainingClips:
     """Simulate one shard; the same (settings, number) gives the same clips."""
-    from utils.simulator.training import ClipSettings, sample_clips
+    from utils.simulator.training import ClipSettings
 
     generator = generator_for(settings.seed, 2, number)
     bank_seed = generator_for(settings.seed, 4, number // SHARDS_PER_BANK).initial_seed() % 2**31
-    clips = sample_clips(settings.clips, settings.frames, settings.height, settings.width, generator=generator,
-                         settings=ClipSettings(bank_size=BANK_SIZE, bank_seed=bank_seed))
-    return TrainingClips(clips.voxels, clips.world_T_cam, clips.inv_depths, clips.intrinsics).to("cpu").check()
+    bank = ClipSettings(bank_size=BANK_SIZE, bank_seed=bank_seed)
+    size = settings.clips, settings.frames, settings.height, settings.width
+    return sampled_clips(*size, generator=generator, settings=bank).to("cpu").check()
+
+
+def sampled_clips(clips: int, frames: int, height: int, width: int, **options: Any) -> TrainingClips:
+    """Random clips as a trainer takes them; arguments of `utils.simulator.training.sample_clips`."""
+    from utils.simulator.training import sample_clips
+
+    made = sample_clips(clips, frames, height, width, **options)
+    return TrainingClips(made.voxels, made.world_T_cam, made.inv_depths, made.intrinsics)
 
 
 def shard_settings(settings: TrainSettings) -> ShardSettings:
